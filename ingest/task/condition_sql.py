@@ -1,9 +1,10 @@
-"""Check of a condition's SQL: an expression over the steps of its episode, and nothing else.
+"""Check of a condition's SQL, which may only be an expression over the steps of its episode.
 
-Profiles are passed between strangers, so a condition is read before it is run: no query inside,
-no other table, no function that looks outside the row's data (files, settings, time, chance) or
-that grows without bound. It stays in its episode, and a `pre` condition looks at no later step.
-Beside that DuckDB runs it without access to files and with its settings locked.
+Profiles are passed between strangers, so the SQL of a condition is parsed and checked before it
+runs. It may contain no query and no other table, and no function that reads anything but the steps
+(files, settings, the time, random numbers) or whose result grows without bound. Its windows must
+stay in the episode, and those of a `pre` condition must not look at later steps. In addition,
+DuckDB runs it without access to files and with locked settings.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Iterator
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
-if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+if TYPE_CHECKING:  # slow to import, and not needed for conditions that are in the store already
     import duckdb
 
 WINDOW = "WINDOW episode AS (PARTITION BY episode_index ORDER BY step_index)"
@@ -34,13 +35,13 @@ _REFUSED = {
 }
 _BRACKETS = "its brackets do not match"
 _UNBALANCED = f"{_BRACKETS}: a condition must be one expression over the steps"
-# Macros of DuckDB's own that compute from their arguments alone; the others look around.
+# DuckDB's built-in macros that depend only on their arguments; the others read session state.
 _MACROS = ("list_", "array_")
 _MORE_MACROS = {
     *("nullif", "if", "fmod", "fdiv", "split_part", "date_add", "days_in_month"),
     *("geomean", "geometric_mean", "wavg", "weighted_avg"),
 }
-# These make values of any size out of two numbers: a few words could keep a machine busy.
+# Functions that make values of any size from two numbers: a short text could fill the memory.
 _GROWING = {
     *("repeat", "list_repeat", "array_repeat", "range", "generate_series", "generate_subscripts"),
     *("lpad", "rpad", "bar", "list_resize", "array_resize", "printf", "format", "factorial"),
@@ -49,10 +50,10 @@ _GROWING = {
 _MORE_ROWS = {"unnest", "unlist"}
 _OF_X = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
 _WINDOWED = {*_OF_X, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
-# Of a zone that is given, or fixed as it is here.
+# Functions that use a time zone: it is an argument, or the session's, which is fixed here.
 _OF_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
-# Aggregates that depend on the order of the rows, beside those that windows have by themselves.
+# Aggregates that depend on the order of the rows; window functions do in any case.
 _OF_ORDER = {
     *("any_value", "arbitrary", "list", "array_agg"),
     *("string_agg", "group_concat", "listagg"),
@@ -66,31 +67,31 @@ _BACKWARD = {
 }
 
 
-# Computes columns over the table `steps`, or over what is made of it.
+# Query that computes columns over the table `steps`, or over a subquery of it.
 SELECT = "SELECT {columns} FROM {source} " + WINDOW + " ORDER BY row_"
 
 
 @cache
 def sandbox() -> duckdb.DuckDBPyConnection:
-    """Return the database of all conditions, of which each use takes a `cursor`.
+    """Return the one database in which all conditions run; each use opens a `cursor`.
 
-    Opening one takes longer than the labels of an episode.
+    Opening a database takes longer than labelling an episode.
     """
     import duckdb
 
-    atexit.register(sandbox.cache_clear)  # nanobind complains of what outlives its module
+    atexit.register(sandbox.cache_clear)  # nanobind warns about objects that outlive its module
     connection = duckdb.connect(config=SANDBOX)
-    connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's
+    connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's time zone
     connection.execute("SET lock_configuration = true").fetchall()
     return connection
 
 
 @lru_cache(maxsize=1024)
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
-    """Return why this SQL may not be a condition's, or None; DuckDB finds unknown names."""
+    """Return why a condition may not have this SQL, or None; unknown names are left to DuckDB."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
-        # What closes our bracket and opens another fits into one kind of them only.
+        # SQL that closes our bracket and opens another one parses in one kind of brackets only.
         both = [SELECT.format(columns=f"{a}{sql}\n{b}", source="steps") for a, b in ("()", "[]")]
         ((text, other),) = connection.execute(query, both).fetchall()
     try:
@@ -117,7 +118,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
 
 
 def _plain_query(node: dict[str, Any]) -> bool:
-    """Return whether the query around the expression is still the one that we wrote."""
+    """Return whether the parsed query around the expression still is `SELECT`."""
     source = node["from_table"]
     return (
         source["type"] == "BASE_TABLE"
@@ -144,7 +145,7 @@ def _walk(part: Any) -> Iterator[dict[str, Any]]:
 def _refuse(part: dict[str, Any], timing: str) -> str | None:
     kind = part["class"]
     if kind == "STAR" and not part["columns"]:
-        return None  # count(*); anywhere else it does not bind
+        return None  # count(*); DuckDB refuses it anywhere else
     if kind in _REFUSED:
         return _REFUSED[kind]
     if kind == "FUNCTION" and part["function_name"].lower() in _GROWING:
@@ -190,14 +191,17 @@ def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
 
 @lru_cache(maxsize=1024)
 def names_in(sql: str) -> frozenset[str]:
-    """Return the columns that an expression names, in lower case; `refusal` read it before."""
+    """Return the columns that an expression names, in lower case; `refusal` must accept it."""
     columns = (part for part in _parsed(sql) if part["class"] == "COLUMN_REF")
     return frozenset(part["column_names"][-1].lower() for part in columns)
 
 
 @lru_cache(maxsize=1024)
 def steps_back(sql: str) -> int | None:
-    """Return how many steps an expression without refusal looks back; None: to the first."""
+    """Return how many steps an expression looks back; None: to the first step of the episode.
+
+    `refusal` must accept the expression.
+    """
     windows = [part for part in _parsed(sql) if part["class"] == "WINDOW"]
     back = [_window_back(part) for part in windows]
     return None if None in back else max((steps for steps in back if steps is not None), default=0)
@@ -216,7 +220,7 @@ def _window_back(part: dict[str, Any]) -> int | None:
 
 
 def _parsed(sql: str) -> Iterator[dict[str, Any]]:
-    """Yield every node of an expression that `refusal` has nothing against."""
+    """Yield every node of an expression that `refusal` accepts."""
     with sandbox().cursor() as connection:
         query = SELECT.format(columns=f"({sql}\n)", source="steps")
         ((text,),) = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [query]).fetchall()
@@ -228,7 +232,7 @@ def _column(part: dict[str, Any]) -> str:
 
 
 def _constant(part: dict[str, Any] | None) -> bool:
-    """Return whether it is a number that is not negative."""
+    """Return whether a node is a constant integer of 0 or more."""
     if part is None or part["class"] != "CONSTANT":
         return False
     return str(part["literal"]["text"]).isdigit()
@@ -238,8 +242,8 @@ def _constant(part: dict[str, Any] | None) -> bool:
 def _outside() -> frozenset[str]:
     """Return the names of functions whose result depends on more than their arguments.
 
-    `+` and `date_trunc` of a time with a zone follow the zone that is set, which is fixed here:
-    by those a name is not one of them.
+    `+` and `date_trunc` of a time with a zone depend on the session's zone. It is fixed here, so
+    these functions are not among the names.
     """
     with sandbox().cursor() as connection:
         macros = connection.sql(
@@ -247,14 +251,14 @@ def _outside() -> frozenset[str]:
         ).fetchall()
     return (
         _changing()
-        | {"age", "error"}  # age of one time: until today
+        | {"age", "error"}  # age() of a single time depends on today
         | {name for (name,) in macros if not name.startswith(_MACROS) and name not in _MORE_MACROS}
     )
 
 
 @cache
 def _changing() -> frozenset[str]:
-    """Return the names of functions that may return something else when called again."""
+    """Return the names of functions that may return another value when called again."""
     with sandbox().cursor() as connection:
         rows = connection.sql(
             "SELECT DISTINCT function_name, stability, parameter_types::VARCHAR[]"
@@ -270,7 +274,7 @@ def _changing() -> frozenset[str]:
 
 @lru_cache(maxsize=1024)
 def not_an_expression(sql: str) -> str | None:
-    """Return why this SQL may not stand between brackets of ours, or None."""
+    """Return why this SQL is not one expression that can be put into brackets, or None."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
         both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # as in `refusal`
@@ -285,9 +289,9 @@ def not_an_expression(sql: str) -> str | None:
 
 @lru_cache(maxsize=1024)
 def not_repeatable(sql: str) -> str | None:
-    """Say what in an expression may differ between runs on the same rows, or return None.
+    """Return what makes an expression differ between runs on the same rows, or None.
 
-    SQL that cannot be read is `not_an_expression`'s to refuse.
+    Also None for SQL that cannot be parsed: `not_an_expression` refuses that.
     """
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR)"
@@ -295,7 +299,7 @@ def not_repeatable(sql: str) -> str | None:
     for part in _walk(json.loads(text).get("statements", [])):
         kind = part["class"]
         name = part.get("function_name", "").lower()
-        if kind == "COLUMN_REF" and len(part["column_names"]) == 1:  # current_date, without ()
+        if kind == "COLUMN_REF" and len(part["column_names"]) == 1:  # e.g. current_date without ()
             name = part["column_names"][0].lower()
             if not name.startswith("current_"):
                 continue

@@ -1,32 +1,32 @@
 """Conditions: named SQL expressions over the steps of an episode, for logs and twin alike.
 
-A condition is one boolean expression, with window functions allowed: `OVER episode` orders an
-episode's steps up to the current one's place (`lead(…)` looks one step ahead), and
-`OVER (episode ROWS BETWEEN 2 PRECEDING AND CURRENT ROW)` is a window of that order. Its timing
-says what it may look at:
+A condition is one boolean expression that may use window functions. The window `episode` holds an
+episode's steps in order: `lead(…) OVER episode` looks one step ahead, and
+`OVER (episode ROWS BETWEEN 2 PRECEDING AND CURRENT ROW)` looks at the last three steps. The timing
+of a condition limits which steps it may look at:
 
-- `pre`: known before acting at step t; looks at step t and earlier ones only;
+- `pre`: known before acting at step t; looks only at step t and earlier steps;
 - `post`: about the outcome of step t; may look at t + 1 and later.
 
-Intermediate results may be named first: each `let` is a column that later ones may use, so that a
-window function can look over another's results.
+Intermediate results can be named: each `let` is a column that later `let`s and the condition can
+use, so that one window function can be applied to the results of another.
 
 A condition may have a **probability** beside its label: an expression of the same kind with values
 from 0 to 1, computed from the distance of the signals to the rule's limits and the noise of the
 sensors. A step whose probability lies within the condition's `uncertain` band is uncertain.
 
-Its limits may follow the robot: its SQL may name the profile's [noise], and `Task.condition_limits`
-(how near is near, how much is slip, the control period); a number of steps may be written as a
-time, `{1.6 s}`, or as a distance that the robot drives at its highest speed, `{0.2 m}`.
+The limits can depend on the robot. The SQL may name the profile's [noise] and
+`Task.condition_limits` (tight clearance, slip limit, control period and more). A number of steps
+may be written as a time, `{1.6 s}`, or as the distance driven at the highest speed, `{0.2 m}`.
 
-A condition is of one of two kinds. An **outcome** (the default) names a result, and gives a row its
-one `condition`. An **exposure** names the situation, whatever the outcome: someone close by, a
-blocked plan. It is `pre`, has no probability, is listed beside the outcomes (`exposures`), and
-never takes a row's condition from them. Use exposures for strata and comparisons of success if an
-outcome would select the failures.
+There are two kinds of condition. An **outcome** (the default) names a result; a row's one
+`condition` is an outcome. An **exposure** names the situation, whatever the outcome: someone close
+by, a blocked plan. Its timing is `pre`, it has no probability, it is listed in a column of its own
+(`exposures`), and it is never a row's `condition`. Use exposures for strata and comparisons of
+success if an outcome would select the failures.
 
-A condition can be a `.sql` file: one that comes with Restock, or one beside a profile. The file has
-the rule, in parts, and in comments the settings:
+A condition can be a `.sql` file that comes with Restock or lies beside a profile. The file contains
+the rule, in parts, and the settings as comments:
 
     -- What it is, and why the rule is as it is.
     -- timing: post
@@ -39,13 +39,13 @@ the rule, in parts, and in comments the settings:
     -- probability:
     1 / (1 + exp(-20 * (slip_mps - 0.2)))
 
-A file of one expression is the label. Comments before the first part are the doc, those in a part
-are not.
+If a file is a single expression, that is the label. Comments before the first part are the doc;
+comments within a part are not.
 
-The difference of timings matters to replay: boosting a `post` stratum resamples the outcome of an
-action and biases what the critic learns, unless it is corrected for. What else a condition may not
-say is in `restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored
-against it.
+The timing matters to replay: boosting a `post` stratum resamples the outcome of an action and
+biases what the critic learns, unless that is corrected. `restock.ingest.task.condition_sql` checks
+what the SQL may contain. If a simulator recorded the true conditions, labels are scored against
+them.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ from restock.ingest.task.condition_sql import SANDBOX, SELECT, WINDOW, refusal, 
 from restock.ingest.task.task import LIDAR_SIGNALS, PLAN_SIGNALS, STAND_IN_LIMITS, Noise
 from restock.toml import Checked
 
-if TYPE_CHECKING:  # slow to import, and not for what is in the store already
+if TYPE_CHECKING:  # slow to import, and not needed for conditions that are in the store already
     import duckdb
 
 Timing = Literal["pre", "post"]
@@ -81,18 +81,19 @@ Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
 NOMINAL = "nominal"
 _LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
-# What conditions may take on a recording: those that Restock brings take a thirtieth of it a step.
+# Time limit for all conditions of a recording. The shipped ones take 1/30 of the limit per step.
 LIMIT_S, LIMIT_S_PER_STEP = 60.0, 0.001
-NO_LIDAR = "no lidar"  # why a condition is unknown
-DRIVEN_PLAN = "the plan is the path that was driven"  # and so nothing stood on it
+# Reasons why a condition is unknown.
+NO_LIDAR = "no lidar"
+DRIVEN_PLAN = "the plan is the path that was driven"  # so no obstacle can have stood on it
 
 
 Column = tuple[str, NDArray[Any]]  # DuckDB's type, and values (N,), masked if there are nulls
-Columns = dict[tuple[str, Expression], Column]  # by the condition's name
+Columns = dict[tuple[str, Expression], Column]  # keys: the condition's name, and the expression
 
 
 class Condition(Checked, frozen=True):
-    """A named label. Lower priority numbers win where a row needs one condition."""
+    """A named label. A row's one condition is the label with the lowest priority number."""
 
     name: str
     timing: Timing
@@ -100,16 +101,16 @@ class Condition(Checked, frozen=True):
     priority: int = 50
     doc: str = ""
     let: dict[str, str] = msgspec.field(default_factory=dict)  # name -> SQL; may use earlier names
-    probability: str = ""  # SQL that gives 0 to 1; "": none
+    probability: str = ""  # SQL with values from 0 to 1; "": the condition has no probability
     uncertain: tuple[float, float] = (0.2, 0.8)  # probabilities that count as uncertain
     constants: dict[str, float] = msgspec.field(default_factory=dict)  # for use in its SQL
-    kind: Kind = "outcome"  # "exposure": a situation, whatever the outcome
+    kind: Kind = "outcome"
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
-        """Return the condition of one robot, with the constants that its SQL names; its own win.
+        """Return the condition with those of a robot's constants that its SQL names.
 
-        Where they are a robot's, times such as `{1.6 s}`, and ways such as `{0.2 m}` at its highest
-        speed, become numbers of steps.
+        The condition's own constants take precedence. If `constants` has `control_period_s`, times
+        such as `{1.6 s}` and distances such as `{0.2 m}` are replaced by numbers of steps.
         """
         words, made = self.words, dict[str, Any]()
         used = {name: value for name, value in constants.items() if name in words}
@@ -123,7 +124,7 @@ class Condition(Checked, frozen=True):
 
     @property
     def words(self) -> set[str]:
-        """Return every word of its SQL, of its `let`s and its probability."""
+        """Return every word of its SQL, its `let`s and its probability."""
         expressions = (self.sql, self.probability, *self.let.values())
         return {word for text in expressions for word in re.findall(r"\w+", text)}
 
@@ -147,22 +148,22 @@ class Condition(Checked, frozen=True):
 
 
 def in_steps(sql: str, constants: Mapping[str, float]) -> str:
-    """Convert times, and ways at the robot's highest speed, in SQL to steps, at least 1."""
+    """Replace times, and distances at the robot's highest speed, in SQL by steps, at least 1."""
     period_s = constants["control_period_s"]
     a_step = {"s": period_s, "m": period_s * constants["fastest_mps"]}
     return _LENGTH.sub(lambda found: str(max(round(float(found[1]) / a_step[found[2]]), 1)), sql)
 
 
 def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:
-    """Select the conditions of one kind, in their order."""
+    """Select the conditions of one kind, keeping their order."""
     return [condition for condition in conditions if condition.kind == kind]
 
 
 def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """Read the conditions of a kind of a manifest row.
+    """Read the conditions of a kind from a row of the manifest (the `recordings` table).
 
     Raises:
-        msgspec.MsgspecError: a newer Restock wrote them.
+        msgspec.MsgspecError: a newer Restock wrote the row.
     """
     text = manifest["conditions_json" if kind == "outcome" else "exposures_json"]
     read = msgspec.json.decode(text, type=list[Condition], strict=False)
@@ -172,11 +173,10 @@ def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Conditio
 def unseen(
     conditions: Iterable[Condition], signals: Collection[str] = LIDAR_SIGNALS
 ) -> dict[str, list[str]]:
-    """Return the conditions that need signals that are unknown, and which each names.
+    """Return the conditions that name any of these signals, and the signals that each names.
 
-    By default those of a robot without a lidar.
-
-    A condition that names one is null at every step, whatever its SQL makes of a null.
+    `signals` are unknown; by default they are those that need a lidar. A condition that names an
+    unknown signal is null at every step, whatever its SQL makes of a null.
     """
     lost = {one.name: sorted(one.words & set(signals)) for one in conditions}
     return {name: named for name, named in lost.items() if named}
@@ -185,9 +185,9 @@ def unseen(
 def unknown_rows(
     conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
 ) -> list[dict[str, Any]]:
-    """Return what a robot's steps do not show, as manifests hold it.
+    """Return the conditions that are unknown for a recording, as rows for the manifest.
 
-    Without a lidar, or with the path that was driven as their plan, as goals in hindsight have it.
+    `driven_plan` means that the plan is the path that was driven, as with goals in hindsight.
     """
     definitions = list(conditions)
     unknown: dict[str, tuple[list[str], str]] = {}
@@ -213,7 +213,7 @@ def unknown_rows(
 def reported(
     conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
 ) -> list[Condition]:
-    """Return the conditions that such steps can show."""
+    """Return the conditions that are not in `unknown_rows`."""
     conditions = list(conditions)
     rows = unknown_rows(conditions, lidar=lidar, driven_plan=driven_plan)
     lost = {row["condition"] for row in rows}
@@ -224,7 +224,7 @@ def labels_version(conditions: Sequence[Condition]) -> str:
     """Return a hash of a set of conditions, 12 hex digits."""
     said = [
         (c.name, c.timing, c.sql, c.priority)
-        # Nothing more where there is nothing more: so that the version of a plain rule stays.
+        # Optional settings are hashed only if used, so that the version of a plain rule stays.
         + ((c.probability, c.uncertain) if c.probability else ())
         + ((list(c.let.items()), sorted(c.constants.items())) if c.let or c.constants else ())
         + ((c.kind,) if c.kind != "outcome" else ())
@@ -237,22 +237,22 @@ def labels_version(conditions: Sequence[Condition]) -> str:
 def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
     """Evaluate every condition over a table of steps, in the table's row order.
 
-    `steps` holds `episode_index`, `step_index` and the stored signals, one row a step, including
-    the last step of each episode (which is no transition, but whose signals `lead` sees).
+    `steps` has `episode_index`, `step_index` and the stored signals, one row per step, including
+    the last step of each episode. That step is not a transition, but `lead` needs its signals.
 
     Raises:
-        ConfigError: a condition's SQL does not run, or gives no boolean; names the condition.
+        ConfigError: a condition's SQL does not run or is not boolean; names the condition.
     """
     return _labels(_evaluate(steps, conditions, ("sql",)), conditions)
 
 
 def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F32]:
-    """Compute the probability of every condition with a rule for it, over steps as in `label`.
+    """Compute the probability of every condition that has one, over steps as in `label`.
 
-    NaN where the rule gives null.
+    Null becomes NaN.
 
     Raises:
-        ConfigError: the SQL does not run, or gives other than numbers in [0, 1].
+        ConfigError: the SQL does not run, or its values are not numbers in [0, 1].
     """
     return _probabilities(_evaluate(steps, conditions, ("probability",)), conditions)
 
@@ -260,10 +260,10 @@ def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str,
 def label_with_probabilities(
     steps: pa.Table, conditions: Sequence[Condition]
 ) -> tuple[dict[str, Bools], dict[str, F32]]:
-    """Compute `label` and `probabilities` together, their common parts once.
+    """Compute `label` and `probabilities` together, which computes common parts only once.
 
     Raises:
-        ConfigError: as they do.
+        ConfigError: as `label` and `probabilities`.
     """
     columns = _evaluate(steps, conditions, ("sql", "probability"))
     return _labels(columns, conditions), _probabilities(columns, conditions)
@@ -272,9 +272,10 @@ def label_with_probabilities(
 def label_several(
     several: Sequence[tuple[pa.Table, Sequence[Condition]]],
 ) -> list[tuple[dict[str, Bools], dict[str, F32]]]:
-    """Compute `label_with_probabilities` of several tables, those alike in one query.
+    """Compute `label_with_probabilities` of several tables of steps.
 
-    Planning a query takes longer than labelling some hundred steps.
+    Tables with the same conditions and schema share a query, as planning a query takes longer than
+    labelling some hundred steps.
     """
     found: dict[int, tuple[dict[str, Bools], dict[str, F32]]] = {}
     for place, (steps, conditions) in enumerate(several):
@@ -286,7 +287,7 @@ def label_several(
             if other not in found and rules == conditions and table.schema == steps.schema
         ]
         if any("episode_index" in condition.words for condition in conditions):
-            alike = [place]  # else it would see other numbers
+            alike = [place]  # a shared query renumbers the episodes
         parts, first = [], 0
         for table in (several[other][0] for other in alike):
             episodes = np.asarray(table["episode_index"]) + first
@@ -332,7 +333,7 @@ def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
     """Compute every `let` of a condition at each step, (N,); NaN for null.
 
     Raises:
-        ConfigError: its SQL does not run, or gives other than numbers.
+        ConfigError: its SQL does not run, or its values are not numbers.
     """
     values: dict[str, F64] = {}
     for name in condition.let:
@@ -345,7 +346,7 @@ def numbers(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F64]:
     """Evaluate the SQL of conditions as numbers at each step, (N,): true is 1, null is NaN.
 
     Raises:
-        ConfigError: it does not run, or gives other than numbers; names the condition.
+        ConfigError: the SQL does not run, or its values are not numbers; names the condition.
     """
     columns = _evaluate(steps, conditions, ("sql",)).items()
     return {name: _numbers(column, f"condition {name!r}") for (name, _), column in columns}
@@ -362,7 +363,7 @@ def _numbers(column: Column, where: str) -> F64:
 def too_near_to_call(
     probable: Mapping[str, F32], conditions: Sequence[Condition]
 ) -> dict[str, Bools]:
-    """Return where each condition's probability lies within its `uncertain` band."""
+    """Return at which steps each condition's probability lies within its `uncertain` band, (N,)."""
     bands = {condition.name: condition.uncertain for condition in conditions}
     return {
         name: (values >= bands[name][0]) & (values <= bands[name][1])
@@ -373,9 +374,13 @@ def too_near_to_call(
 def _evaluate(
     steps: pa.Table, conditions: Sequence[Condition], which: Sequence[Expression]
 ) -> Columns:
-    """Evaluate these expressions over the steps, for each condition that has them."""
+    """Evaluate the expressions `which` of all conditions over the steps.
+
+    Conditions with the same `let`s and constants share a query. If the query fails, each of its
+    expressions runs alone, so that the error names the condition.
+    """
     requested = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
-    together: dict[str, list[tuple[Condition, Expression]]] = {}  # that select from the same table
+    together: dict[str, list[tuple[Condition, Expression]]] = {}  # by FROM clause
     for condition, part in requested:
         _refuse(condition, part, steps.column_names)
         together.setdefault(_source(condition), []).append((condition, part))
@@ -398,7 +403,7 @@ def _evaluate(
             try:
                 columns |= _query(connection, several, len(steps), left_s)
             except duckdb.Error as together_error:
-                for condition, part in several:  # again one by one, to say which
+                for condition, part in several:
                     try:
                         _query(
                             connection, [(condition, part)], len(steps), limit_s / len(requested)
@@ -411,7 +416,7 @@ def _evaluate(
 
 
 def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -> NoReturn:
-    """Raise what DuckDB says of a condition's SQL as a ConfigError."""
+    """Raise DuckDB's error about a condition's SQL as a ConfigError."""
     import duckdb
 
     if isinstance(error, duckdb.InterruptException):
@@ -435,7 +440,7 @@ def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -
 
 
 def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> None:
-    """Raise ConfigError if its SQL contains what no condition may."""
+    """Raise ConfigError if a name is taken or the SQL contains what conditions may not."""
     taken = {"row_", *(name.lower() for name in columns)}
     for name in (*condition.constants, *condition.let):
         if name.lower() in taken:
@@ -457,7 +462,7 @@ def _where(condition: Condition, which: Expression) -> str:
 
 
 def _source(condition: Condition) -> str:
-    """Build what its expressions select from: the steps, constants, and `let`s one by one."""
+    """Build the FROM clause of a condition: the steps, its constants, and a subquery per `let`."""
     source = "steps"
     if condition.constants:
         named = (f'{float(value)!r}::DOUBLE AS "{n}"' for n, value in condition.constants.items())
@@ -468,7 +473,7 @@ def _source(condition: Condition) -> str:
 
 
 def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return the conditions whose SQL runs over steps with these columns."""
+    """Return the conditions whose SQL runs over steps with the columns of `steps`."""
     run = []
     for condition in conditions:
         with suppress(ConfigError):
@@ -483,10 +488,10 @@ def _query(
     count: int,
     limit_s: float,
 ) -> Columns:
-    """Evaluate conditions that select from the same tables, one value per step of `count`.
+    """Evaluate conditions with the same FROM clause: one value for each of `count` steps.
 
     Raises:
-        duckdb.Error: they do not run, give another number of values, or take longer than they may.
+        duckdb.Error: the query fails, returns another number of values, or exceeds `limit_s`.
     """
     import duckdb
 
@@ -509,13 +514,13 @@ def _query(
 
 @contextmanager
 def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) -> Iterator[None]:
-    """Interrupt the connection if the block takes longer."""
+    """Interrupt the connection's query if the block takes longer than `limit_s`."""
     done = threading.Event()
 
     def interrupt() -> None:
         wait_s = limit_s
         while not done.wait(wait_s):
-            connection.interrupt()  # again and again: an idle connection takes no notice
+            connection.interrupt()  # repeated, as it has no effect between two queries
             wait_s = 0.1
 
     thread = threading.Thread(target=interrupt, daemon=True)
@@ -524,7 +529,7 @@ def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) ->
         yield
     finally:
         done.set()
-        thread.join()  # or it would interrupt the query after this one
+        thread.join()  # otherwise it could interrupt the next query
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
@@ -540,7 +545,7 @@ def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[s
 
 
 def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
-    """Return which rows (N,) of a column of lists name each of these; a null names none."""
+    """Return which rows (N,) of a column of lists contain each name; a null contains none."""
     import pyarrow.compute as pc  # slow to import
 
     lists = column.combine_chunks()
@@ -563,8 +568,8 @@ def shipped(
 ) -> dict[str, Condition]:
     """Read the conditions of a kind that come with Restock: `ingest/task/conditions/*.sql`.
 
-    `constants` are `Profile.constants` of the robot whose steps they label; None: of the stand-in,
-    with a profile's default noise.
+    `constants` are the `Profile.constants` of the robot whose steps they label; None: those of the
+    stand-in robot, with the default noise of profiles.
     """
     constants = constants or Noise().constants | STAND_IN_LIMITS
     return {one.name: one for one in of_kind(_of_robot(tuple(constants.items())), kind)}
@@ -577,7 +582,7 @@ def _of_robot(constants: tuple[tuple[str, float], ...]) -> list[Condition]:
 
 @cache
 def _as_shipped() -> list[Condition]:
-    """Read the conditions of both kinds, sorted by name, without the constants of a robot."""
+    """Read the shipped conditions of both kinds, sorted by name, without a robot's constants."""
     folder = files("restock.ingest.task") / "conditions"
     texts = {
         one.name: one.read_text("utf-8") for one in folder.iterdir() if one.name[-4:] == ".sql"
@@ -619,7 +624,7 @@ def settings_of(text: str) -> dict[str, Any]:
 
 
 def _value(text: str) -> str | int | list[str | float]:
-    """Parse a whole number, `0.2 to 0.8`, or a word; the type check refuses others by key."""
+    """Parse a whole number, `0.2 to 0.8`, or a word; the type check reports wrong types by key."""
     if text.lstrip("-").isdigit():
         return int(text)
     if " to " not in text:
@@ -629,14 +634,13 @@ def _value(text: str) -> str | int | list[str | float]:
 
 
 def with_files(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """Replace each `[[condition]] file = "…"` of a profile's TOML by the text of that file.
+    """Replace each `[[condition]] file = "…"` of a profile's TOML by the settings in that file.
 
-    A file may say `-- timing: pre` and `-- priority: 45` in comments, as the shipped ones do;
-    what the TOML says goes first. Its name must stay in the profile's folder: profiles are
-    passed between strangers.
+    Settings in comments of the file, such as `-- timing: pre`, give way to keys in the TOML. The
+    file must be in the profile's folder, as profiles are passed between strangers.
 
     Raises:
-        ConfigError: no such file, or one that lies elsewhere; names the key.
+        ConfigError: the file does not exist or is outside the folder; names the key.
     """
     conditions = document.get("condition")
     if not isinstance(conditions, list):

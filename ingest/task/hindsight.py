@@ -1,12 +1,13 @@
 """Goals in hindsight: the place that a drive reached is its goal (arXiv:1707.01495).
 
-For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
-where it ended: where the robot stood still, where it turned back, or as far as an episode may go.
-Where the drive passed that place on its way, left it and came back, the mission ends at the first
-pass, and the rest is cut again. The route is the driven way, thinned and without its loops.
+They serve recordings without a goal topic. A drive is cut into missions, and the goal of each
+mission is the place where it ended: where the robot stood still, where it turned back, or as far as
+an episode may go. If the drive passed that place earlier, left it and came back, the mission ends
+at the first pass, and the rest is cut again. The route is the driven path, thinned and without
+loops.
 
-Goal and route are from the future, by definition; nothing else here is. Every mission arrives, by
-construction: its success says nothing of who drove.
+Goal and route come from the future, by definition; nothing else here does. Every mission arrives by
+construction, so that its success is no evidence about the driver.
 """
 
 from __future__ import annotations
@@ -24,14 +25,16 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.task import Task
 from restock.toml import Checked
 
-NO_MISSION = "goal: none in hindsight"  # what ticks without one are counted as
+NO_MISSION = "goal: none in hindsight"  # drop reason of ticks without a mission
 STANDING = f"{NO_MISSION}, standing still"
 NOWHERE = f"{NO_MISSION}, nowhere far enough"
 
-_SHORTEST = 3.0  # goal radii from start to goal, at least
-_WAIT_S = 10.0  # standing before the start, at most, that belongs to the mission
-_BACK = 0.6  # of the farthest from its start: nearer again, the robot has turned back
-_LIMIT = 0.9  # of the task's time limit
+_SHORTEST = 3.0  # shortest distance from start to goal, in goal radii
+_WAIT_S = 10.0  # longest standing before the start that belongs to the mission
+_BACK = (
+    0.6  # the robot has turned back if its distance from the start is below this share of the max
+)
+_LIMIT = 0.9  # longest mission, as a share of the task's time limit
 
 GoalSource = Literal["logged", "hindsight"]
 
@@ -39,31 +42,31 @@ GoalSource = Literal["logged", "hindsight"]
 class GoalRules(Checked, frozen=True):
     """The `[goal]` of a profile: where a route's goals come from."""
 
-    source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or in hindsight
-    still_s: Annotated[float, Meta(gt=0)] = 3.0  # how long a robot stands when it has arrived
-    longest_m: Annotated[float, Meta(gt=0)] = 10.0  # from start to goal
+    source: GoalSource = "logged"  # "logged": from inputs.goal and inputs.plan
+    still_s: Annotated[float, Meta(gt=0)] = 3.0  # a robot that stands this long has arrived
+    longest_m: Annotated[float, Meta(gt=0)] = 10.0  # longest distance from start to goal
 
 
 def shortest_m(task: Task) -> float:
-    """Return how far a goal must be from where its mission starts."""
+    """Return the shortest distance from a mission's start to its goal."""
     return _SHORTEST * task.goal_radius_m
 
 
 @dataclass(frozen=True)
 class Missions:
-    """A recording's missions (M of them), and which one each of T ticks is in."""
+    """A recording's M missions, and the mission of each of T ticks."""
 
-    mission: Ints  # (T,) -1: none
+    mission: Ints  # (T,) index of the mission; -1: none
     goals_m: F64  # (M, 2)
     routes_m: list[F64]  # each (P, 2), from the mission's start to its goal
-    ended_at: list[str]  # (M,) why there
-    standing: Bools  # (T,) and for longer than before or after a mission
+    ended_at: list[str]  # (M,) why the mission ends there
+    standing: Bools  # (T,) whether the robot stands still, except while a mission drives
     driven_m: float
     shortest_m: float
 
     @property
     def problem(self) -> list[str]:
-        """Return why each tick has no goal, or "", (T,)."""
+        """Return why each tick has no goal, (T,); "" if it has one."""
         without = np.where(self.mission < 0, NOWHERE, "")
         return [str(text) for text in np.where(self.standing, STANDING, without)]
 
@@ -88,17 +91,17 @@ def missions(
     """Split a drive into missions.
 
     Args:
-        rules: how long, how far.
-        task: whose goal radius and time limit hold.
+        rules: how long the robot stands at a goal, and the longest distance to it.
+        task: for its goal radius and time limit.
         xy_m: (T, 2) positions.
-        stamp_ns: (T,) of the ticks.
-        located: (T,) whether the position is known; where it is not, the drive goes on.
-        leg: (T,) another number where the robot was carried, or the clock was set: no mission
-            goes on beyond that.
+        stamp_ns: (T,) stamps of the ticks.
+        located: (T,) whether the position is known; an unknown position does not end a drive.
+        leg: (T,) a number that changes whenever the robot was carried or the clock was set; every
+            mission lies within one leg.
     """
     at = np.flatnonzero(located)
     found = _Cutting(rules, task, xy_m[at], stamp_ns[at], leg[at]).missions()
-    # Ticks without a position are as the one before them.
+    # Ticks without a position get the mission of the tick before.
     before = np.searchsorted(at, np.arange(len(stamp_ns)), "right") - 1
     mission = np.where(before >= 0, np.append(found.mission, -1)[before], -1)
     standing = (before >= 0) & np.append(found.standing, False)[before]
@@ -106,7 +109,7 @@ def missions(
 
 
 class _Cutting:
-    """Cuts a drive, leg by leg: a leg is what the robot drove without being carried."""
+    """Cuts a drive into missions, leg by leg; within a leg the robot was not carried."""
 
     def __init__(self, rules: GoalRules, task: Task, xy_m: F64, stamp_ns: Ints, leg: Ints) -> None:
         self.rules, self.radius_m = rules, task.goal_radius_m
@@ -115,7 +118,7 @@ class _Cutting:
         self.leg = leg
         self.shortest_m = shortest_m(task)
         self.longest_s = _LIMIT * task.time_limit_steps * task.control_period_s
-        self.standing = self._standing()  # and, after the cutting, in no mission
+        self.standing = self._standing()  # ticks of a mission are cleared as it is added
         self.mission = np.full(len(xy_m), -1, np.int64)
         self.goals: list[F64] = []
         self.routes: list[F64] = []
@@ -138,24 +141,24 @@ class _Cutting:
         )
 
     def _cut_leg(self, first: int, last: int, end: str) -> None:
-        """Find missions between the places where the robot stood still."""
+        """Add the missions between the places where the robot stood still."""
         changes = np.flatnonzero(np.diff(self.standing[first : last + 1].astype(np.int8)))
         stood = first
         bounds = [first, *(changes + first + 1).tolist(), last + 1]
         for begin, stop in pairwise(bounds):
             if self.standing[begin]:
-                if self.mission[begin] >= 0:  # the goal that was reached stays in force
+                if self.mission[begin] >= 0:  # the reached goal stays in force while it stands
                     self.mission[begin:stop] = self.mission[begin]
                 stood = begin + 1 if self.mission[begin] >= 0 else begin
                 continue
             arrives = stop <= last
-            # What it did before it set off belongs to the drive: it looked where to go, and turned.
+            # The time just before the robot set off is part of the drive: it turned to its way.
             since = np.searchsorted(self.at_s, self.at_s[begin] - _WAIT_S, "left")
             start = min(max(stood, int(since)), begin)
             self._cut_drive(start, stop if arrives else last, "stood still" if arrives else end)
 
     def _cut_drive(self, start: int, stop: int, end: str) -> None:
-        """Find missions of a drive without a stop, from tick `start` to tick `stop`."""
+        """Add the missions of a drive without a stop, from tick `start` to tick `stop`."""
         while start < stop:
             late = np.searchsorted(self.at_s, self.at_s[start] + self.longest_s, "right") - 1
             reach = min(stop, max(int(late), start + 1))
@@ -172,33 +175,33 @@ class _Cutting:
             else:
                 goal, why = self._way_point(start, away)
             if away[goal - start] < self.shortest_m:
-                start = max(goal, start + 1)  # got nowhere
+                start = max(goal, start + 1)  # too near to be a goal
                 continue
             start = self._add(start, goal, why, last=goal == stop)
 
     def _way_point(self, start: int, away: F64) -> tuple[int, str]:
-        """Return where to end a drive that goes on: the last place that is far enough."""
+        """Return the goal's tick if the drive goes on: the last tick far enough from the start."""
         far = np.flatnonzero(away >= self.shortest_m)
         return start + (int(far[-1]) if len(far) else len(away) - 1), "far enough"
 
     def _add(self, start: int, end: int, why: str, *, last: bool) -> int:
-        """Add the mission that ends at tick `end`; where the next one starts."""
+        """Add the mission that ends at tick `end`; return the tick at which the next one starts."""
         goal = self._place(self.xy_m[end])
         gap = np.hypot(*(self.xy_m[start : end + 1] - goal).T)
         arrival = start + int(np.flatnonzero(gap <= self.radius_m)[0])
-        if (gap[arrival - start :] > self.shortest_m).any():  # an episode ends where it arrives
+        if (gap[arrival - start :] > self.shortest_m).any():  # episodes end on arrival
             end, why, last = arrival, "came back later", False
         number = len(self.goals)
         self.goals.append(goal)
         self.routes.append(route_of(self.xy_m[start : end + 1], goal, self.radius_m / 2))
         self.ended_at.append(why)
-        # A drive that goes on has its next goal at once, where this one is reached.
+        # If the drive goes on, the next goal is in force as soon as this one is reached.
         self.mission[start : (end if last else arrival) + 1] = number
         self.standing[start:end] = False
         return end if last else max(arrival, start + 1)
 
     def _place(self, goal: F64) -> F64:
-        """Return the goal, or the goal of an earlier mission at the same place."""
+        """Return the goal of an earlier mission at the same place, if any, or else this goal."""
         if self.goals:
             gap = np.hypot(*(np.array(self.goals) - goal).T)
             if gap.min() <= self.radius_m / 2:
@@ -206,9 +209,9 @@ class _Cutting:
         return goal
 
     def _standing(self) -> Bools:
-        """Return ticks (T,) of the stretches of `still_s` in which the robot stays in its place.
+        """Return at which ticks (T,) the robot stays in its place for `still_s` or longer.
 
-        By position, so that turning on the spot is standing too.
+        Judged by position, so that turning in place counts as standing.
         """
         count = len(self.at_s)
         until = np.searchsorted(self.at_s, self.at_s + self.rules.still_s, "left")  # (T,)
@@ -224,7 +227,7 @@ class _Cutting:
 
 
 def driven_m(xy_m: F64, leg: Ints, band_m: float) -> float:
-    """Return the distance driven, counting only steps of more than `band_m`, not noise."""
+    """Return the distance driven, in steps of more than `band_m`, so that noise does not count."""
     driven, here = 0.0, (math.nan, math.nan, -1)
     for x, y, number in zip(xy_m[:, 0].tolist(), xy_m[:, 1].tolist(), leg.tolist(), strict=True):
         step = math.hypot(x - here[0], y - here[1])
@@ -236,9 +239,9 @@ def driven_m(xy_m: F64, leg: Ints, band_m: float) -> float:
 
 
 def route_of(driven_m: F64, goal_m: F64, spacing_m: float) -> F64:
-    """Return the driven way (N, 2) as a route (P, 2): about `spacing_m` apart, without loops.
+    """Thin the driven path (N, 2) to a route (P, 2) of points about `spacing_m` apart.
 
-    Where the way comes back to a point, what lies between is left out.
+    If the path comes back to a point, the loop between is left out.
     """
     points, here = [driven_m[0]], 0
     while here < len(driven_m) - 1:

@@ -1,7 +1,7 @@
-"""The columns of a store: names, types, units and meanings; other types are derived from these.
+"""The columns of a store: names, types, units and meanings; the Arrow schemas derive from these.
 
-A row is one transition and stands alone: the observation after it is in the row, so rows stay
-whole under any filter, sort or engine.
+A row is one self-contained transition. It includes the next observation, so that rows can be
+filtered and sorted in any way by any engine.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from restock.arrays import Ints
 from restock.ingest.task.conditions import NOMINAL
 from restock.ingest.task.task import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
 
-# transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
+# transition_id = (a number from the recording's id) << STEP_BITS | (tick of the recording)
 STEP_BITS = 25
-GOLDEN = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: the step between splitmix64's states
+GOLDEN = 0x9E3779B97F4A7C15  # 2**64 / golden ratio: the increment of splitmix64's state
 
 
 def transition_ids(recording_id: str, tick: Ints) -> Ints:
-    """Return the ids of a recording's steps (N,) by their places on its control clock."""
+    """Return the transition ids (N,) of ticks of a recording's control clock (N,), from 0."""
     number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
     return (number << STEP_BITS) + tick
 
 
 def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Mix 64-bit numbers, alike on every machine (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Return hashes of 64-bit numbers, equal on every machine (Steele et al., OOPSLA 2014)."""
     mixed = (states ^ (states >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
@@ -40,7 +40,7 @@ def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table. `observation` types get their length from the task."""
+    """A column of the table. The task sets the length of observations."""
 
     name: str
     type: pa.DataType
@@ -59,13 +59,13 @@ IDENTITY: tuple[Column, ...] = (
     Column(
         "logged_ns",
         pa.int64(),
-        "the time stamp_ns as log time; ages are computed from it",  # null: by clock_offset_ns
+        "stamp_ns converted to log time; ages are computed from it",  # null: use clock_offset_ns
         nullable=True,
     ),
 )
 TRANSITION: tuple[Column, ...] = (
     Column(
-        "observation", _F32_LIST, "observation at t: what the robot knew; float32[D], see the task"
+        "observation", _F32_LIST, "observation at t, from data up to t; float32[D], see the task"
     ),
     Column("action", pa.int16(), "index of the discrete action in force over [t, t + 1)"),
     Column("reward", pa.float32(), "reward of [t, t + 1)"),
@@ -87,10 +87,10 @@ COVERAGE: tuple[Column, ...] = (
     Column(
         "probabilities",
         pa.map_(pa.string(), pa.float32()),
-        "probability of each condition that has a rule for it",
+        "probability of each condition that defines one",
     ),
     Column(
-        "uncertain", pa.list_(pa.string()), "conditions that are uncertain by their probability"
+        "uncertain", pa.list_(pa.string()), "conditions whose probability is in the uncertain band"
     ),
     Column("exposures", pa.list_(pa.string()), "all exposures that hold, whatever the condition"),
     Column(
@@ -99,7 +99,7 @@ COVERAGE: tuple[Column, ...] = (
         "all exposures that are true in the simulator, sorted, comma-separated; or nominal",
         nullable=True,
     ),
-    Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
+    Column("perturbation", pa.string(), "name of the twin's parameters", nullable=True),
     Column(
         "perturbation_values",
         pa.map_(pa.string(), pa.float64()),
@@ -149,7 +149,7 @@ COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS 
 
 
 def signal_arrays(signals: Signals) -> dict[str, pa.Array]:
-    """Return signals for SQL: unknown values are null, since NaN would pass for a number."""
+    """Return signals for SQL: unknown values become null, since SQL takes NaN for a number."""
     return {
         name: pa.array(np.asarray(values), from_pandas=name in OPTIONAL_SIGNALS)
         for name, values in signals.items()
@@ -157,7 +157,7 @@ def signal_arrays(signals: Signals) -> dict[str, pa.Array]:
 
 
 def signal_columns(signals: Signals, rows: Ints | slice = slice(None)) -> dict[str, pa.Array]:
-    """Convert the stored signals (of some rows) to columns of the table."""
+    """Convert the stored signals of these rows to columns of the table."""
     arrays = signal_arrays({column.name: signals[column.name][rows] for column in SIGNAL_COLUMNS})
     return {
         column.name: arrays[column.name].cast(column.type, safe=False) for column in SIGNAL_COLUMNS
@@ -165,7 +165,7 @@ def signal_columns(signals: Signals, rows: Ints | slice = slice(None)) -> dict[s
 
 
 def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
-    """Return the schema of steps as conditions see them: stored signals, and custom ones."""
+    """Return the schema of the steps that conditions run on: stored and custom signals."""
     keys = [("episode_index", pa.int64()), ("step_index", pa.int64())]
     signals = [(column.name, column.type) for column in SIGNAL_COLUMNS]
     return pa.schema([*(pa.field(*field) for field in keys + signals), *custom])
@@ -174,7 +174,7 @@ def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
 def transition_schema(observation_size: int, custom: Sequence[pa.Field] = ()) -> pa.Schema:
     """Return the Arrow schema of rows whose observations have `observation_size` entries.
 
-    `custom` are the columns of a profile's own signals; they come last.
+    `custom` are the columns of a profile's custom signals; they come last.
     """
     sized = pa.list_(pa.field("element", pa.float32()), observation_size)
     return pa.schema(
@@ -194,7 +194,7 @@ def _rows_of(**fields: pa.DataType) -> pa.DataType:
     return pa.list_(pa.struct(list(fields.items())))
 
 
-# One row an ingest: what was read, by which definitions, and what became of it.
+# The `recordings` table: one row per ingest, with the input, the definitions used and the counts.
 RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
     Column("ingest_id", pa.string(), "id of this ingest; joins `transitions`"),
@@ -207,7 +207,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("end_stamp_ns", pa.int64(), "time of its last step, on the alignment clock"),
     Column("clock", pa.string(), "the alignment clock: header.stamp or log_time"),
     Column("clock_offset_ns", pa.int64(), "log time minus alignment clock"),
-    Column("clock_jumps", pa.int32(), "how often the alignment clock was set"),
+    Column("clock_jumps", pa.int32(), "number of jumps of the alignment clock"),
     Column("profile", pa.string(), "name of the profile with which it was ingested"),
     Column("profile_hash", pa.string(), "hash of the profile, 12 hex digits"),
     Column("task_hash", pa.string(), "hash of the definition of observation, action and reward"),
@@ -224,14 +224,14 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("episodes", pa.int64(), "number of episodes with at least one transition"),
     Column("transitions", pa.int64(), "number of rows in `transitions`"),
     Column("episode_ends", pa.int64(), "number of ticks that only end an episode"),
-    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks that are in no episode"),
+    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks without an episode"),
     Column(
         "topics",
         _rows_of(
             topic=pa.string(), type=pa.string(), expected=pa.int64(), decoded=pa.int64(),
             skipped=pa.int64(), reason=pa.string(),
         ),
-        "number of messages by the container's count, number decoded, and why the rest were not",
+        "messages that the container counts, messages decoded and skipped, and why skipped",
     ),
     Column(
         "stand_ins",
@@ -263,7 +263,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             log_backsteps=pa.int64(), backsteps=pa.int64(), duplicates=pa.int64(),
             zero_stamps=pa.int64(), off_clock=pa.int64(), restamped=pa.int64(),
         ),
-        "per topic that was read: log time against header stamp, and irregular stamps",
+        "per topic that was read: log time minus header stamp, and counts of irregular stamps",
     ),
     Column(
         "findings",
@@ -271,8 +271,8 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             kind=pa.string(), topic=pa.string(), what=pa.string(), steps=pa.int64(),
             cause=pa.string(), remedy=pa.string(), repaired=pa.bool_(),
         ),
-        "topics that contradict the rest of the recording: how far, in how many steps, the likely "
-        "cause, what to do",
+        "topics that contradict the rest of the recording: by how much, in how many steps, the "
+        "likely cause, what to do",
     ),
     Column(
         "signals",
@@ -293,8 +293,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             size_bytes=pa.int64(), file=pa.string(),
         ),
         "per camera: messages expected and decoded; frames kept, thinned out (max_hz) and unused "
-        "(in"
-        " force at no step); problems; steps with a frame",
+        "(latest frame at no step); problems; steps with a frame",
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
@@ -309,12 +308,12 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             condition=pa.string(), kind=pa.string(), signals=pa.list_(pa.string()),
             because=pa.string(),
         ),
-        "conditions and exposures that are unknown in all its rows",
+        "conditions and exposures that are unknown in all rows of the recording",
     ),
     Column(
         "uncertain_conditions",
         pa.list_(pa.string()),
-        "conditions and exposures whose labels rest on an outline that is a guess",
+        "conditions and exposures whose labels depend on an outline that is a guess",
     ),
     Column(
         "corrections",
@@ -323,12 +322,12 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             first_ns=pa.int64(), last_ns=pa.int64(), given_at=pa.timestamp("us", "UTC"),
             rows=pa.int64(),
         ),
-        "corrections of its labels by people, see the view",
+        "people's corrections of its labels, see the view `corrections`",
     ),
     Column("profile_toml", pa.string(), "the profile, including the SQL of its files"),
 )  # fmt: skip
 
-# One row a frame of a camera that is in force at a step: `frames/` of a store.
+# The table `frames/` of a store: one row per camera frame that is the latest frame at some step.
 FRAME_COLUMNS: tuple[Column, ...] = (
     Column("recording_id", pa.string(), "id of the recording"),
     Column("camera", pa.string(), "its name in the profile"),
@@ -338,12 +337,12 @@ FRAME_COLUMNS: tuple[Column, ...] = (
     Column("log_time_ns", pa.int64(), "when the message was recorded"),
     Column("stamp_ns", pa.int64(), "when the frame was taken, on the alignment clock"),
     Column(
-        "first_transition_id", pa.int64(), "time of the first step at which it is the last frame"
+        "first_transition_id", pa.int64(), "id of the first step at which it is the latest frame"
     ),
     Column(
         "last_transition_id",
         pa.int64(),
-        "time of the last such step, including steps that only end an episode",
+        "id of the last such step, including steps that only end an episode",
     ),
     Column(
         "encoding",
@@ -367,7 +366,7 @@ def frame_schema() -> pa.Schema:
     return pa.schema([pa.field(one.name, one.type, nullable=False) for one in FRAME_COLUMNS])
 
 
-DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")  # many share one
+DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")  # equal in many rows
 
 
 def recording_schema() -> pa.Schema:
@@ -382,20 +381,20 @@ VALUES = pa.map_(pa.string(), pa.float64())
 
 @dataclass(frozen=True)
 class Perturbed:
-    """Sets of parameters, and which was in force at each of T places; -1: not known."""
+    """Sets of the twin's parameters, and the set in force at each of T ticks."""
 
     sets: Sequence[tuple[str, Mapping[str, float]] | None]  # name, values; None: unreadable
-    row: Ints  # (T,) of `sets`
+    row: Ints  # (T,) indices into `sets`; -1: unknown
     notes: list[str] = field(default_factory=list)
 
     @classmethod
     def unknown(cls, count: int) -> Perturbed:
-        """Return unknown parameters, as hardware has: its friction is unknown."""
+        """Return unknown parameters, as for hardware, whose friction is unknown."""
         return cls([], np.full(count, -1, np.int64))
 
     @classmethod
     def read(cls, texts: Sequence[str], row: Ints) -> Perturbed:
-        """Parse messages `{"name", "values": {field: number}}`, and keep which holds where."""
+        """Parse messages `{"name", "values": {field: number}}`; `row` (T,) indexes `texts`."""
         sets = [parse_perturbation(text) for text in texts]
         unread = sum(item is None for item in sets)
         many = "message is" if unread == 1 else "messages are"
@@ -403,7 +402,7 @@ class Perturbed:
         return cls(sets, row, notes if unread else [])
 
     def columns(self, places: Ints) -> tuple[pa.Array, pa.Array]:
-        """Return `perturbation` and `perturbation_values` at some places (n,)."""
+        """Return `perturbation` and `perturbation_values` at these ticks (n,)."""
         named = [None if item is None else item[0] for item in self.sets]
         values = [None if item is None else list(item[1].items()) for item in self.sets]
         row = self.row[places]
@@ -412,7 +411,7 @@ class Perturbed:
 
 
 def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
-    """Parse `{"name": …, "values": {field: number}}` into the two; None if it is something else."""
+    """Parse `{"name": …, "values": {field: number}}` into name and values; None if malformed."""
     try:
         message = json.loads(text)
         name, values = message["name"], message["values"]
@@ -424,23 +423,23 @@ def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
     return name, numbers
 
 
-# Where a reader needs one true condition: the first of these, then any other by its name.
+# Order of precedence if a reader needs one true condition; others follow by name.
 PRIMARY = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
 
 
 def truth_text(names: Iterable[str]) -> str:
-    """Join a step's true conditions to one text: sorted, commas between; "nominal" for none."""
+    """Join a step's true conditions: sorted and comma-separated, or "nominal" if there are none."""
     return ",".join(sorted(set(names))) or NOMINAL
 
 
 def true_names(text: str) -> frozenset[str]:
-    """Return the true conditions that a text names: none for "nominal"."""
+    """Parse the text of `truth_text`; "nominal" gives an empty set."""
     named = frozenset(part.strip() for part in text.split(","))
     return named - {NOMINAL, ""}
 
 
 def primary_of(text: str) -> str:
-    """Return the one condition of a text that names all, for readers that need one."""
+    """Return the one true condition of a text of `truth_text`, for readers that need one."""
     named = true_names(text)
     for name in (*PRIMARY, *sorted(named)):
         if name in named:

@@ -1,15 +1,15 @@
-"""Surroundings of a robot: clearance around it, its place along the plan, and who came nearer.
+"""Surroundings of a robot, on logs and in the twin: clearance, view of the plan, and approaches.
 
 A scan is reduced to the clearance of each sector of bearing: the distance from the body's outline
 to the nearest return.
 
 A plan is a polyline in the map frame, as a navigation stack publishes it (`nav_msgs/Path`), from
 somewhere near the robot to its goal. Plans are padded to a common length by repeating their last
-point, which adds segments of no length at the end.
+point, which adds segments of length 0 at the end.
 
-Two scans say who came nearer and what lies on the plan. Of every sector the nearest return is
-taken as a point on the sector's middle bearing: with 36 sectors it is within .17 m of where it is
-at 2 m. For logs and twin alike.
+To find what came nearer, and what lies on the plan, the nearest return of every sector is taken as
+a point on the sector's middle bearing. With 36 sectors, that point is within .17 m of the return
+at 2 m.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from restock import native
 from restock.arrays import F64, Bools
 from restock.ingest.task.task import Body, Signals, Task
 
-_AWAY_M = 1e-3  # along a beam, so that what is too close is in that beam's direction
-UNSEEN_SECTORS = 3  # at most, that are taken to lie behind what is beside them
+_AWAY_M = 1e-3  # shortest range, so that a return that is too close keeps its beam's direction
+UNSEEN_SECTORS = 3  # widest gap of sectors that is filled with the nearer of its neighbours
 
 
 @dataclass(frozen=True)
 class SectorMap:
-    """Map of beams to sectors, and how far the body reaches along each beam.
+    """Map of beams to sectors, and the body's extent along each beam.
 
     Sector 0 starts straight behind (-pi) and sectors go counter-clockwise, so that the robot's
     forward axis lies between sectors K/2 - 1 and K/2. Built once per lidar geometry.
     """
 
     sectors: int
-    order: NDArray[np.intp] | slice  # (B,) beams sorted by sector; a slice: they are
+    order: NDArray[np.intp] | slice  # (B,) beams sorted by sector; a slice if they already are
     starts: NDArray[np.intp]  # (filled,) first position of each non-empty sector in `order`
     filled: NDArray[np.intp]  # (filled,) the sectors that have beams
     reach_m: NDArray[np.float64]  # (B,) from the lidar to the outline along the beam
 
     @classmethod
     def build(cls, bearings_rad: NDArray[Any], sectors: int, body: Body) -> SectorMap:
-        """Return bearings (B,) of the beams in the lidar's own frame."""
+        """Build the map from the beams' bearings (B,) in the lidar's own frame."""
         bearing = (np.asarray(bearings_rad, np.float64) + body.lidar_yaw_rad + np.pi) % (2 * np.pi)
         sector = np.minimum((bearing * (sectors / (2 * np.pi))).astype(np.intp), sectors - 1)
         order = np.argsort(sector, kind="stable")
@@ -62,10 +62,10 @@ class SectorMap:
         """Reduce ranges (N, B) to clearance per sector (N, K), in [0, range_max_m].
 
         inf, NaN, and readings below `range_min_m` (the driver's "no valid return") or above
-        `range_max_m` count as free up to `range_max_m`; so does a sector without beams. -inf is
-        too close to be measured (REP 117): clearance 0.
+        `range_max_m` count as free up to `range_max_m`; so does a sector without beams. -inf means
+        too close to measure (REP 117), so the clearance is 0.
         """
-        with np.errstate(invalid="ignore"):  # a damaged range may be a NaN that signals
+        with np.errstate(invalid="ignore"):  # a damaged range may be a signalling NaN
             ranges = np.asarray(ranges_m, np.float64)
         valid = returned(ranges, range_min_m, range_max_m)
         near = ranges - self.reach_m
@@ -79,21 +79,21 @@ class SectorMap:
 
 @dataclass(frozen=True)
 class MovedMap:
-    """Map of beams to sectors for a lidar that is not where the body has its own.
+    """Map of beams to sectors for a lidar at another position than `[task.body]` gives.
 
-    Where its beams end is seen from the body's place, so a beam's sector depends on its range.
+    Sectors are seen from the body's lidar position, so a beam's sector depends on its range.
     """
 
     sectors: int
     body: Body
-    from_m: tuple[float, float]  # of this lidar, ahead and left of the body's own
-    ways: NDArray[np.float64]  # (2, B) of the beams: cosines and sines, in the body's frame
+    from_m: tuple[float, float]  # position of this lidar ahead and left of the body's
+    ways: NDArray[np.float64]  # (2, B) cosines and sines of the beams, in the body's frame
 
     @classmethod
     def build(
         cls, bearings_rad: NDArray[Any], sectors: int, body: Body, at_m: tuple[float, float]
     ) -> MovedMap:
-        """Return bearings (B,) of the beams in the body's frame, from a place in it (x, y)."""
+        """Build the map from bearings (B,) and position (x, y) of a lidar in the body's frame."""
         ways = np.stack([np.cos(bearings_rad), np.sin(bearings_rad)])
         return cls(sectors, body, (at_m[0] - body.lidar_x_m, at_m[1]), ways)
 
@@ -102,7 +102,7 @@ class MovedMap:
     ) -> NDArray[np.float64]:
         """Compute `SectorMap.clearance`, but NaN for sectors in which no beam ends (`with_unseen`).
 
-        `range_min_m` is from this lidar, `range_max_m` from the body's own.
+        `range_min_m` is measured from this lidar, `range_max_m` from the body's lidar position.
         """
         with np.errstate(invalid="ignore"):
             ranges = np.asarray(ranges_m, np.float64)
@@ -125,17 +125,17 @@ class MovedMap:
 
 
 def returned(ranges_m: F64, range_min_m: float, range_max_m: float) -> Bools:
-    """Return which ranges mean that something is there: False for NaN and inf, True for -inf."""
+    """Return which ranges are returns of an object: False for NaN and inf, True for -inf."""
     inside = (ranges_m >= range_min_m) | (ranges_m == -np.inf)
     return np.asarray(inside & (ranges_m <= range_max_m), np.bool_)
 
 
 def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray[np.float64]:
-    """Fill sectors without a beam's end, NaN, in clearances (N, K).
+    """Fill sectors in which no beam ends (NaN) in clearances (N, K).
 
-    What lies behind a near thing, as a lidar beside the middle sees it, is as near as the nearer of
-    the sectors on either side, over up to UNSEEN_SECTORS. More are beyond the lidars' view: free up
-    to `range_max_m`, as a sector without beams is.
+    A gap of up to UNSEEN_SECTORS sectors is the shadow of a near object, seen by a lidar off the
+    middle. It gets the clearance of the nearer of the two sectors beside it. A wider gap is outside
+    the lidars' field of view, and free up to `range_max_m`, as a sector without beams is.
     """
     rows = np.flatnonzero(np.isnan(clearance_m).any(axis=1))
     if not len(rows):
@@ -162,16 +162,16 @@ def outline_reach(bearings_rad: NDArray[np.float64], body: Body) -> NDArray[np.f
     ahead = np.where(
         cos >= 0, body.length_m / 2 - body.lidar_x_m, body.length_m / 2 + body.lidar_x_m
     )
-    with np.errstate(divide="ignore", over="ignore"):  # along an axis the other side is far
+    with np.errstate(divide="ignore", over="ignore"):  # along an axis, one term is inf
         return np.minimum(np.maximum(ahead, 0.0) / np.abs(cos), (body.width_m / 2) / np.abs(sin))
 
 
-ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
+ROUNDING = 1e-13  # tolerance of squared distances: relative, plus a tenth of it in m^2
 
 
 @dataclass(frozen=True)
 class RouteView:
-    """View of its plan for a robot at a pose."""
+    """What N robots see of their plans from their poses."""
 
     look_ahead_m: F64  # (N, L, 2) look-ahead points in the body frame (x forward, y left)
     remaining_m: F64  # (N,) arc length from the nearest point on the plan to its end
@@ -191,10 +191,10 @@ def pad_plans(plans: Sequence[NDArray[Any]]) -> F64:
 def view_route(
     plans_m: F64, pose_x_m: F64, pose_y_m: F64, pose_yaw_rad: F64, distances_m: Sequence[float]
 ) -> RouteView:
-    """Return look-ahead points at `distances_m` along plans (N, P, 2), from poses (N,).
+    """Find look-ahead points at `distances_m` along plans (N, P, 2), from poses (N,).
 
-    A look-ahead point beyond the end of the plan is its end. Compiled code, where there is some
-    (`restock.native`), does what NumPy does without it, to the last bit.
+    A look-ahead point beyond the end of the plan is its end. Compiled code (`restock.native`), if
+    in use, gives the same result as NumPy, to the last bit.
     """
     cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
     if native.IS_USED:
@@ -213,7 +213,7 @@ def view_route(
     along = np.minimum(np.maximum(along, 0.0), 1.0)
     gap_x, gap_y = off_x - along * step_x, off_y - along * step_y
     distance2 = gap_x * gap_x + gap_y * gap_y
-    # Where a plan comes by twice it is at the first time, whatever rounding makes of the two.
+    # If a plan passes the robot twice, the first pass counts, whatever the rounding of the two.
     least = distance2.min(axis=1, keepdims=True)
     nearest = np.argmax(distance2 <= least + ROUNDING * (least + 0.1), axis=1)  # (N,), the first
     rows = np.arange(len(plans_m))
@@ -255,36 +255,37 @@ def _view_compiled(
     return RouteView(look_ahead_m, remaining_m, offset_m)
 
 
-NEAR_M = 2.0  # of clearance, for who comes nearer
-REMEMBERED_S = 1.0  # what was seen that long ago was there already
-FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden before
-MIN_S = 0.25  # of such a walk: a lidar may be slower than the steps
-PLAN_PARTS = 3  # between two look-ahead points, and to the first
-GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
+NEAR_M = 2.0  # largest clearance at which `came_nearer` looks for approaches
+REMEMBERED_S = 1.0  # a return that was there within this time has not come nearer
+FASTEST_MPS = 2.0  # fastest walk: a return that approaches faster was hidden before
+MIN_S = 0.25  # shortest time to compute a walk over: a lidar may be slower than the steps
+PLAN_PARTS = 3  # points per stretch of plan: to the near waypoint, and from it to the far one
+GAP_WITHIN = 1.4  # length of the plan just ahead, in units of `near_m`
 MOTION = (*("stamp_ns", "gyro_yaw_rate_radps"), *("localised_speed_mps", "localised_lateral_mps"))
-SCANNED = (*MOTION, "sector_clearance_m")  # the signals that `came_nearer` takes
-_ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
+SCANNED = (*MOTION, "sector_clearance_m")  # signals that `came_nearer` needs
+_ROUNDING_M = 1e-6  # tolerance for clearances of `range_max_m`, which mean that nothing came back
 
 
 def steps_remembered(task: Task) -> int:
-    """Return how many earlier steps `came_nearer` looks at."""
+    """Return the number of earlier steps that `came_nearer` looks at."""
     return max(round(REMEMBERED_S / task.control_period_s), 1)
 
 
 def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     """Return how far (m) something came nearer since the step before, (N,); 0 if nothing did.
 
-    A return of now within NEAR_M is put where the robot was at each of the steps before, by the
-    localised and the gyroscope's motion. Where the lidar saw farther at all of them, in that sector
-    and both beside it, it has come; the smallest of these ways is how far. So the edge that a beam
-    now hits and now misses does not come, nor does what it came upon behind a corner, which is too
-    far to have walked. Where no beam of the three sectors came back nothing is known. NaN without a
+    Each current return within NEAR_M is moved into the robot's frame at each earlier step, by the
+    localised speed and the gyroscope. It has come nearer if, at all these steps, the lidar saw
+    farther in the return's sector and both sectors beside it; the smallest of these differences is
+    how far. So an edge that a beam hits only sometimes does not count. Neither does something that
+    appears from behind a corner, as it is nearer by more than anybody walks. A step at which no
+    beam of the three sectors returned shows nothing, and the return does not count. NaN without a
     lidar.
 
     Args:
         now: the signals SCANNED.
-        earlier: those of the steps before, the last one first, `steps_remembered` of them or fewer;
-            where an episode has none that early, its first again.
+        earlier: the same of up to `steps_remembered` earlier steps, the last one first; before the
+            start of an episode, its first step is repeated.
     """
     clearance, count = now["sector_clearance_m"], task.sectors
     if not count:
@@ -296,7 +297,7 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     if not native.IS_USED:
         return _came_by_numpy(task, clearance, before, motions, walked_m)
     sectors, came = _sectors(count, task.body), np.empty(len(clearance))
-    native.compiled.find_came(  # the same, to the last bit
+    native.compiled.find_came(  # equal to NumPy's result, to the last bit
         *(np.ravel(clearance), before.reshape(-1), motions.reshape(-1)),
         walked_m,
         *(sectors.cos, sectors.sin, sectors.reach_m, sectors.ends),
@@ -308,11 +309,11 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
 
 def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked_m: F64) -> F64:
     count, sectors = task.sectors, _sectors(task.sectors, task.body)
-    # The same scan again, of a lidar slower than the steps, tells nothing.
+    # If the lidar is slower than the steps, a scan is repeated, and shows no motion.
     reported = (clearance != before[0]).any(axis=1)
     row, sector = np.nonzero((clearance < NEAR_M) & reported[:, None])
     distance = (clearance + sectors.reach_m)[row, sector]
-    lever = task.body.lidar_x_m  # points are of the lidar, turns about the middle of the body
+    lever = task.body.lidar_x_m  # points are seen from the lidar, the body turns about its middle
     x, y = distance * sectors.cos[sector] + lever, distance * sectors.sin[sector]
     came = np.full(len(row), np.inf)
     for scan, motion in zip(before, motions, strict=True):
@@ -338,7 +339,7 @@ def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked
 
 
 def _motions(scans: Sequence[Signals]) -> F64:
-    """Return the motion from each step's body frame to that of the step before, last step first.
+    """Return the transform from each step's body frame to that of the step before, newest first.
 
     As x, y, cosine and sine of the turn, (steps - 1, 4, N).
     """
@@ -355,7 +356,7 @@ def _motions(scans: Sequence[Signals]) -> F64:
 
 
 def plan_distances_m(task: Task) -> tuple[float, ...]:
-    """Return the distances along the plan, from its nearest point, searched for returns."""
+    """Return distances along the plan, from its nearest point, for `returns_on_plan`."""
     parts = [part / PLAN_PARTS for part in range(1, PLAN_PARTS)]
     near = (task.near_m * part for part in parts)
     beyond = (task.near_m + (task.far_m - task.near_m) * part for part in parts)
@@ -363,16 +364,17 @@ def plan_distances_m(task: Task) -> tuple[float, ...]:
 
 
 def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64]:
-    """Find what lies on the plan and how far off its middle, by its points `plan_m` (N, L, 2).
+    """Find lidar returns on and beside the plan.
 
-    The points are those at `plan_distances_m`, in the body frame, and the plan the line over them.
+    `plan_m` (N, L, 2) are the plan's points at `plan_distances_m`, in the body frame; the plan is
+    the line through them.
 
     Returns:
-        way_m: along the plan to the first lidar return within half the body's width of it, (N,).
-        gap_m: from the plan just ahead (`GAP_WITHIN` of `near_m`) to the return nearest to it,
+        way_m: distance along the plan to the first return within half the body's width of it, (N,).
+        gap_m: distance from the plan just ahead (`GAP_WITHIN` of `near_m`) to the nearest return,
             (N,).
-        Both are `range_max_m` where there is none. A task without a goal has no plan, and nothing
-        is on it. NaN without a lidar.
+        Both are `range_max_m` if there is no return, or the task has no goal and thus no plan, and
+        NaN without a lidar.
     """
     none = np.full(len(clearance_m), float(task.range_max_m) if task.sectors else np.nan)
     if task.goal == "none" or not task.sectors:
@@ -384,7 +386,7 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         (task.body.width_m / 2) ** 2,
         GAP_WITHIN * task.near_m,
     )
-    if native.IS_USED:  # the same, to the last bit
+    if native.IS_USED:  # equal to NumPy's result, to the last bit
         way_m, gap_m = np.empty(len(none)), np.empty(len(none))
         native.compiled.find_returns(
             *(np.ravel(x), np.ravel(y), np.ravel(clearance_m), np.ravel(plan_m)),
@@ -392,8 +394,8 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         )
         return way_m, gap_m
     range_m, range2, on_plan2, ahead_m = limits
-    off2 = np.full(clearance_m.shape, np.inf)  # of each return from the plan, squared
-    along_m = np.zeros(clearance_m.shape)  # the plan, to where it is nearest
+    off2 = np.full(clearance_m.shape, np.inf)  # squared distance of each return from the plan
+    along_m = np.zeros(clearance_m.shape)  # distance along the plan to its point nearest to it
     passed = np.zeros((len(none), 1))
     for begin, end in pairwise(np.moveaxis(plan_m, 1, 0)):
         line_x, line_y = (end - begin)[:, :1], (end - begin)[:, 1:]
@@ -419,10 +421,10 @@ def sector_returns(task: Task, clearance_m: F64) -> tuple[F64, F64]:
 
 
 class _Sectors(NamedTuple):
-    cos: F64  # (K,), of the middle bearing
+    cos: F64  # (K,) of the middle bearing
     sin: F64
-    reach_m: F64  # (K,), how far the body reaches that way
-    ends: F64  # (K - 1,), where each but the last ends, as `_turned`
+    reach_m: F64  # (K,) extent of the body in that direction
+    ends: F64  # (K - 1,) end of each sector but the last, as `_turned` values
 
 
 @lru_cache(maxsize=64)
@@ -441,7 +443,7 @@ def _sectors(count: int, body: Body) -> _Sectors:
 def _turned(x: F64, y: F64) -> F64:
     """Return a value that grows with the bearing of points, from -2 behind the robot to 2.
 
-    It is rounded alike wherever it is computed.
+    Unlike an arctangent, it is rounded the same on every machine.
     """
     far = np.abs(x) + np.abs(y)
     part = y / np.where(far > 0, far, 1.0)

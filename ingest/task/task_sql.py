@@ -1,13 +1,13 @@
-"""SQL of a task's own: terms of its reward, and entries of its observation.
+"""A task's own SQL: reward terms and observation entries that a profile adds.
 
-Each is an expression over the steps that passes the check of a `pre` condition, gives a number, and
-is evaluated as conditions are, by the same code on logs, in the twin and on a running robot.
+Each is a numeric expression over the steps that must pass the check of a `pre` condition. It is
+evaluated like a condition, by the same code on logs, in the twin and on a running robot.
 
 - A reward term is evaluated at the step that ends a transition: `bumped` is the bumper at t + 1,
-  `lag(x) OVER episode` the signal at t. Its window is the episode up to there.
-- An entry of the observation is evaluated at the step that is observed. A running robot does not
-  know where ingest will cut its drive, so its window is the steps that follow each other without a
-  break, and it looks back on a limited number of them.
+  `lag(x) OVER episode` the signal at t. Its window is the episode up to that step.
+- An observation entry is evaluated at the observed step. A running robot cannot know where ingest
+  will cut its drive into episodes, so the window is the unbroken run of steps up to this one, and
+  the entry may only look back a limited number of steps.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from restock.ingest.task.schema import SIGNAL_COLUMNS, signal_arrays, steps_sche
 from restock.ingest.task.task import OWN_LIMIT, Signals, Task
 from restock.state import Stateful
 
-Table = Literal["reward_terms", "observed"]  # of [task]
-MAX_VALUE = 1e9  # more is no reward, and no reading of a sensor
+Table = Literal["reward_terms", "observed"]  # table of [task] that holds the SQL
+MAX_VALUE = 1e9  # larger values are refused: neither a reward nor a sensor reading
 _COMMANDS = {"command_speed_mps", "command_yaw_rate_radps"}
-_UNFILLED = re.compile(r'column (?:named )?"(\w+)"')  # in DuckDB's words, of one that is not there
+_UNFILLED = re.compile(r'column (?:named )?"(\w+)"')  # in DuckDB's error about a missing column
 
 
 def own_sql(task: Task, table: Table) -> list[Condition]:
-    """Return the task's own SQL of one table, with the constants of the robot's task."""
+    """Return the SQL of one table as conditions, with the task's constants."""
     given = getattr(task, table) or {}
     sql = {name: one if isinstance(one, str) else one[1] for name, one in given.items()}
     limits = task.condition_limits
@@ -42,13 +42,15 @@ def own_sql(task: Task, table: Table) -> list[Condition]:
 
 
 def own_values(task: Task, table: Table, steps: pa.Table) -> dict[str, F64]:
-    """Evaluate the SQL of one table at each step (N,); 0 for null.
+    """Evaluate the SQL of one table at each step, (N,); null becomes 0.
 
-    `steps` are as `restock.ingest.task.conditions.label` takes them.
+    `steps` are as in `restock.ingest.task.conditions.label`.
 
     Raises:
-        ConfigError: an expression does not run, may look ahead, names the command, which is chosen
-            after the step, or gives no number; names it.
+        ConfigError: an expression does not run, may look ahead, is not a number or names the
+            command (which is chosen after the step), a signal that needs a lidar that the robot
+            lacks or, in `observed`, the number of step or episode; or `observed` looks back
+            without limit. Names the expression.
     """
 
     def refused(name: str, what: str, remedy: str | None) -> ConfigError:
@@ -78,7 +80,7 @@ def own_values(task: Task, table: Table, steps: pa.Table) -> dict[str, F64]:
 
 
 def own_reward(task: Task, steps: pa.Table) -> F32:
-    """Return what the task's own terms pay (N,) for the transitions that end at steps (N,).
+    """Return the sum (N,) of the task's own reward terms for transitions that end at these steps.
 
     Raises:
         ConfigError: as `own_values`.
@@ -90,10 +92,10 @@ def own_reward(task: Task, steps: pa.Table) -> F32:
 
 
 def own_observation(task: Task, steps: pa.Table) -> F32:
-    """Return the task's own entries of the observation (N, E), within +-OWN_LIMIT.
+    """Return the task's own observation entries (N, E), clipped to +-OWN_LIMIT.
 
     Raises:
-        ConfigError: as `own_values`; its SQL looks back without limit.
+        ConfigError: as `own_values`.
     """
     values = own_values(task, "observed", steps)
     entries = np.stack(list(values.values()), axis=-1)
@@ -103,9 +105,10 @@ def own_observation(task: Task, steps: pa.Table) -> F32:
 def observed_in_log(
     task: Task, signals: Signals, follows: Bools, at: Ints | None = None, now: Signals | None = None
 ) -> F32:
-    """Return the task's own entries (T, E) at each tick of a recording.
+    """Return the task's own observation entries (T, E) at each tick of a recording.
 
-    With `at` (n,) only at these ticks, where `now` (n,) is seen in place of `signals`.
+    `follows` (T,) is whether a tick continues the run of the tick before. With `at` (n,), return
+    the entries (n, E) at these ticks only, and use `now` (n,) there in place of `signals`.
     """
     run = np.cumsum(~follows, dtype=np.int64)
     if at is None:
@@ -122,7 +125,7 @@ def observed_in_log(
 
 
 def _longest(task: Task, table: Table) -> int:
-    """Return how many steps the SQL of a table looks back on, at most an episode."""
+    """Return how many steps the SQL of a table looks back, at most `time_limit_steps`."""
     back = [steps_back(one.sql) for one in own_sql(task, table)]
     most = task.time_limit_steps
     return min(max(most if steps is None else steps for steps in back), most)
@@ -141,10 +144,11 @@ def _steps(columns: Signals, episode: Ints, step: Ints) -> pa.Table:
 
 
 class Past(Stateful):
-    """The last steps of N robots, as many as the SQL of a table looks back on.
+    """The last steps of N robots: as many as the SQL of a table looks back on.
 
     Raises:
-        ConfigError: it names what `who` does not fill, such as a profile's `[signals.*]`.
+        ConfigError: the SQL names a column that `who` does not fill, such as a profile's
+            `[signals.*]`.
     """
 
     STATE = ("steps", "columns")
@@ -166,23 +170,23 @@ class Past(Stateful):
             name: np.zeros((robots, self._kept), kind.to_pandas_dtype())
             for name, kind in _named(task, table).items()
         }
-        self.steps = np.zeros(robots, np.int64)  # that each episode has had
+        self.steps = np.zeros(robots, np.int64)  # number of each robot's step in its episode
 
     def begin(self, ids: Ints, signals: Signals) -> None:
-        """Take the first signals (n,) of the episodes of robots `ids` (n,)."""
+        """Begin episodes of robots `ids` (n,) with their first signals (n,)."""
         self.steps[ids] = 0
         for name, column in self.columns.items():
             column[ids, -1] = signals[name]
 
     def step(self, signals: Signals) -> None:
-        """Take the signals (N,) of the next step."""
+        """Add the signals (N,) of the next step."""
         self.steps += 1
         for name, column in self.columns.items():
             column[:, :-1] = column[:, 1:]
             column[:, -1] = signals[name]
 
     def now(self, ids: Ints) -> F32:
-        """Return what the last step of robots `ids` (n,) is paid, (n,), or their entries (n, E)."""
+        """Evaluate the SQL at the last step of robots `ids` (n,): reward (n,) or entries (n, E)."""
         step = self.steps[ids, None] + np.arange(1 - self._kept, 1)  # (n, steps kept)
         robot, place = np.nonzero(step >= 0)
         known = {name: column[ids[robot], place] for name, column in self.columns.items()}

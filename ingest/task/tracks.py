@@ -1,18 +1,18 @@
-"""Tracks of people and forklifts: who moves near the robot, from its scans, causally.
+"""Tracks of people and forklifts that move near the robot, from past and present scans.
 
     tracker = Tracker(task, robots=1)
     tracker.begin(np.array([0]), signals, scan_m, scan_stamp_ns)  # the first step of an episode
-    tracks = tracker.update(signals, scan_m, scan_stamp_ns)  # of each later step: TRACK_SIGNALS
+    tracks = tracker.update(signals, scan_m, scan_stamp_ns)  # each later step: TRACK_SIGNALS
 
 A return is **moving** if an earlier scan saw farther in its direction: the place was free .4 or 1 s
-ago. It is **static** if an earlier scan had a return there, and new otherwise, as behind a corner.
-Neighbouring returns that are not static make a detection. Detections and tracks are matched by
-distance, nearest first, and each track is a Kalman filter of constant velocity, with its own
-uncertainty along and across the line of sight. A track is reported once it was seen moving in
-several scans and has covered some distance, and is dropped if it is lost or stands for some time.
+ago. It is **static** if an earlier scan had a return there. Otherwise it is new, for example behind
+a corner. Neighbouring returns that are not static form a detection. Detections and tracks are
+matched by distance, nearest first. Each track is a Kalman filter with constant velocity, and its
+own uncertainty along and across the line of sight. A track is reported once it was seen moving in
+several scans and has covered some distance. It is dropped if it is lost or stands for some time.
 
-Places are in the frame of the odometry: wheels and gyroscope, and the localised speed where the
-wheels slip. The same code runs on logs, live and in the twin, for all its robots at once.
+Positions are in the odometry frame: wheels and gyroscope, or the localised speed if the wheels
+slip. The same code runs on logs, live and in the twin, for all robots at once.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.task import TRACK_SIGNALS, Signals, Task
 from restock.state import Stateful
 
-SECTORS = 240  # of bearing, 1.5 degrees each: the nearest return of each is kept
+SECTORS = 240  # sectors of bearing, 1.5 degrees each; the nearest return of each is kept
 AROUND = 3  # sectors to either side that a place is compared with: two beams of 5 degrees
-RANGE_M = 5.0  # beyond which nothing is tracked
-LAGS_S = (0.4, 1.0)  # of the earlier scans that a return is compared with
-FREE_M = 0.25  # by which an earlier scan must have seen farther
-SAME_M = 0.2  # within which an earlier return is the same thing
-APART_M = 0.35  # of neighbouring returns of one thing, and what two beams are apart
-LEFT_M, SMALL_M = 0.9, 1.0  # who walks away is so near to the place before, and so small
-WIDEST_M = 3.0  # of a detection: more is a wall, or an error of the odometry
-INSIDE_M = 0.2  # from what is seen of a person to its middle
-MANY = 0.5  # of a scan's returns: if more move, the robot's own motion is wrong
-ACCEL_MPS2 = 1.0  # standard deviation of what people accelerate by
-SPEED_MPS = 1.0  # of a new track's speed
+RANGE_M = 5.0  # range of tracking
+LAGS_S = (0.4, 1.0)  # ages of the earlier scans that a return is compared with
+FREE_M = 0.25  # a place was free if an earlier scan saw farther by more than this
+SAME_M = 0.2  # largest distance from an earlier return of the same object
+APART_M = 0.35  # largest gap between returns of one object, beyond the spacing of the beams
+LEFT_M, SMALL_M = 0.9, 1.0  # limits for people who walk away: distance to the place left, width
+WIDEST_M = 3.0  # widest detection; wider ones are walls or errors of the odometry
+INSIDE_M = 0.2  # distance from a person's visible side to their middle
+MANY = 0.5  # share of a scan's returns; if more move, the odometry is wrong
+ACCEL_MPS2 = 1.0  # standard deviation of people's acceleration
+SPEED_MPS = 1.0  # standard deviation of a new track's speed
 FASTEST_MPS = 3.0
 GATE_M, WIDEST_GATE_M = 0.4, 1.0
-CONFIRM_SCANS, CONFIRM_S, CONFIRM_M = 3, 0.4, 0.25  # seen moving so often, so long and so far
-HIDDEN_S, LOST_S = 0.5, 0.8  # unseen for so long a track is not reported, or dropped
-STANDING_S = 3.0  # without motion: dropped
-STANDING_MPS = 0.3  # faster, what is not static goes on moving
-STOPPED_MPS = 0.5  # slower, a track may be seen in returns that are static
-SLIP_MPS = 0.15  # from the localised speed: the wheels' speed is not the robot's
+CONFIRM_SCANS, CONFIRM_S, CONFIRM_M = 3, 0.4, 0.25  # scans seen moving, age and way to confirm it
+HIDDEN_S, LOST_S = 0.5, 0.8  # time unseen after which a track is not reported, and dropped
+STANDING_S = 3.0  # time without motion after which a track is dropped
+STANDING_MPS = 0.3  # a track that is faster, and not static, counts as moving
+STOPPED_MPS = 0.5  # a track that is slower may be matched with static returns
+SLIP_MPS = 0.15  # if wheel and localised speed differ by more, the wheels slip
 
-# Columns of the array of tracks: the robot, position and velocity (odometry's frame), variances of
+# Columns of the array of tracks: the robot, position and velocity (odometry frame), variances of
 # position and velocity and their covariance along the line of sight and across it, seconds since
 # it was first seen, last seen and last moving, scans in which it moved, its first position, and
-# whether it was confirmed.
+# whether it is confirmed.
 _COLUMNS = 18
 (_ROBOT, _X, _Y, _VX, _VY, _PR, _CR, _WR, _PT, _CT, _WT, _AGE, _MISSED, _STILL, _HITS, _X0, _Y0) = (
     range(_COLUMNS - 1)
@@ -64,21 +64,21 @@ _BEARINGS = (np.arange(SECTORS) + 0.5) * _WIDTH_RAD - np.pi
 
 
 class Lidar:
-    """The beams of a lidar, for scans reduced to the nearest return of each sector."""
+    """The beams of a lidar, which reduces its scans to the nearest return of each sector."""
 
     def __init__(self, bearings_rad: F64, from_m: tuple[float, float] = (0.0, 0.0)) -> None:
-        """`bearings_rad` (B,) of its beams in the body's frame.
+        """Take the beams' bearings (B,) in the body's frame.
 
-        `from_m` is where it is, ahead and left of the place that sectors are seen from.
+        `from_m` is the lidar's position, ahead and left of the point that sectors are seen from.
         """
         self._bearings, self._from_m = bearings_rad, from_m
         self._sector = _sector(bearings_rad)
         self._alone = len(set(self._sector.tolist())) == len(bearings_rad)
 
     def scan(self, ranges_m: F64, range_min_m: float) -> F64:
-        """Return the nearest return (N, SECTORS) of ranges (N, B), in metres; inf: none."""
+        """Reduce ranges (N, B) to the nearest return of each sector (N, SECTORS), m; inf: none."""
         with np.errstate(invalid="ignore"):
-            ranges = np.where(ranges_m >= range_min_m, ranges_m, np.inf)  # NaN is none either
+            ranges = np.where(ranges_m >= range_min_m, ranges_m, np.inf)  # NaN becomes inf, too
         scan_m = np.full((len(ranges), SECTORS), np.inf)
         if self._alone and not any(self._from_m):
             scan_m[:, self._sector] = ranges
@@ -99,19 +99,19 @@ def _sector(bearing_rad: F64) -> NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class _Detections:
-    """Things that are not static, each by the middle of its returns, in the odometry's frame."""
+    """D detected objects, in the odometry frame."""
 
     robot: Ints  # (D,)
-    x_m: F64
+    x_m: F64  # (D,) middle of the object: that of its returns, moved INSIDE_M farther away
     y_m: F64
     along_x: F64  # (D,) unit vector of the line of sight
     along_y: F64
-    across_m: F64  # standard deviation of its place across the line of sight
-    moving: Ints  # (D,) returns that move
-    still: Bools  # (D,) made of static returns
+    across_m: F64  # (D,) standard deviation of the position across the line of sight
+    moving: Ints  # (D,) number of returns that move
+    still: Bools  # (D,) whether made of static returns
 
     def at(self, of: Bools) -> _Detections:
-        """Return some of them."""
+        """Select detections by a mask (D,)."""
         return _Detections(
             *(self.robot[of], self.x_m[of], self.y_m[of], self.along_x[of], self.along_y[of]),
             *(self.across_m[of], self.moving[of], self.still[of]),
@@ -135,15 +135,15 @@ class Tracker(Stateful):
         self.rates = np.zeros((robots, 3))  # forward and sideways speed, yaw rate
         self.stamp_ns = np.zeros(robots, np.int64)
         self.scan_stamp_ns = np.zeros(robots, np.int64)
-        # Of the steps before, the last one first: each sector's nearest return, the nearest and
-        # farthest around it, and where they were seen from.
+        # For each earlier step, newest first: each sector's nearest return, the nearest and
+        # farthest return around it, and the pose that they were seen from.
         self.scan_m = [np.full((robots, SECTORS), np.inf) for _ in range(steps)]
         self.low = [np.full((robots, SECTORS), np.inf) for _ in range(steps)]
         self.high = [np.full((robots, SECTORS), -np.inf) for _ in range(steps)]
         self.seen_from = [np.zeros((robots, 3)) for _ in range(steps)]
 
     def begin(self, ids: Ints, now: Signals, scan_m: F64, scan_stamp_ns: Ints) -> Signals:
-        """Begin anew for robots `ids` (n,), whose signals and scans these are: without tracks."""
+        """Begin episodes of robots `ids` (n,) with their signals and scans; return no tracks."""
         self.tracks = self.tracks[~np.isin(self.tracks[:, _ROBOT], ids)]
         self.pose[ids] = 0.0
         self.rates[ids] = _rates(now)
@@ -155,11 +155,12 @@ class Tracker(Stateful):
         return {name: np.full((len(ids), self.count), np.nan) for name in TRACK_SIGNALS}
 
     def update(self, now: Signals, scan_m: F64, scan_stamp_ns: Ints) -> Signals:
-        """Take the next step of all N robots; return their nearest tracks (N, K), NaN if fewer.
+        """Add the next step of all N robots; return their nearest tracks (N, K), NaN if fewer.
 
         Args:
-            now: the signals at the step. scan_m: (N, SECTORS) by `Lidar.scan`.
-            scan_stamp_ns: (N,) when it was measured, at or before `stamp_ns`.
+            now: the signals at the step.
+            scan_m: (N, SECTORS) the latest scans, from `Lidar.scan`.
+            scan_stamp_ns: (N,) when they were measured, at or before `stamp_ns`.
         """
         self._drive(now)
         fresh = scan_stamp_ns > self.scan_stamp_ns
@@ -167,7 +168,7 @@ class Tracker(Stateful):
         self.scan_stamp_ns = np.maximum(scan_stamp_ns, self.scan_stamp_ns)
         seen_from = self._scanned_at(np.arange(len(fresh)), self.scan_stamp_ns)
         low, high = _around(scan_m)
-        if not fresh.all():  # the same scans again, of lidars slower than the steps
+        if not fresh.all():  # lidars slower than the steps repeat their scans
             old = ~fresh
             low[old], high[old] = self.low[0][old], self.high[0][old]
             scan_m, seen_from[old] = scan_m.copy(), self.seen_from[0][old]
@@ -192,22 +193,19 @@ class Tracker(Stateful):
         self.rates, self.stamp_ns = rates, now["stamp_ns"].copy()
 
     def _scanned_at(self, ids: Ints, scan_stamp_ns: Ints) -> F64:
-        """Return where robots were when their scans were measured, (n, 3)."""
+        """Return the robots' poses when their scans were measured, (n, 3)."""
         ago_s = (self.stamp_ns[ids] - scan_stamp_ns) * 1e-9
         return _moved(self.pose[ids], self.rates[ids], -ago_s)
 
     def _detect(
         self, scan_m: F64, low: F64, seen_from: F64, fresh: Bools
     ) -> tuple[_Detections, F64]:
-        """Return what is not static in scans (N, SECTORS), and the static returns (P, 3).
-
-        These are robot, x and y.
-        """
+        """Return detections in scans (N, SECTORS), and robot, x and y of static returns (P, 3)."""
         robot, sector, x, y = self._places(scan_m, seen_from, fresh)
         distance = scan_m[robot, sector]
         moving, static = np.zeros((2, len(robot)), np.bool_)
         unknown = np.arange(len(robot))
-        for step in reversed(self._steps):  # 1 s ago; what that scan could not see, .4 s ago
+        for step in reversed(self._steps):  # scan of 1 s ago; if that is undecided, of .4 s ago
             low_m, high_m, then_m = self._seen(
                 *(robot[unknown], x[unknown], y[unknown]),
                 *(self.low[step], self.high[step], self.seen_from[step]),
@@ -216,7 +214,7 @@ class Tracker(Stateful):
             same = (low_m < then_m + SAME_M) & (high_m > then_m - SAME_M)
             moving[unknown[free]], static[unknown[same]] = True, True
             unknown = unknown[~free & ~same]
-        # An error of the robot's own motion moves everything.
+        # If most returns seem to move, the odometry is wrong: treat all as static.
         total = np.bincount(robot, minlength=len(scan_m))
         astray = np.bincount(robot[moving], minlength=len(scan_m)) > MANY * np.maximum(total, 8)
         if astray.any():
@@ -227,7 +225,7 @@ class Tracker(Stateful):
         spacing = np.full(len(robot), SECTORS)
         apart = np.where(robot[1:] == robot[:-1], sector[1:] - sector[:-1], SECTORS)
         spacing[1:], spacing[:-1] = apart, np.minimum(spacing[:-1], apart)
-        spacing = np.minimum(spacing, SECTORS // 45)  # farther apart, beams have no return between
+        spacing = np.minimum(spacing, SECTORS // 45)  # a wider gap is beams without a return
         apart_m = APART_M + spacing * _WIDTH_RAD * distance
         joined = np.zeros(len(robot), np.bool_)
         joined[1:] = kept[1:] & kept[:-1] & (robot[1:] == robot[:-1])
@@ -251,7 +249,7 @@ class Tracker(Stateful):
         along_x, along_y = along_x / away, along_y / away
         few = wide < WIDEST_M
         moves = np.add.reduceat(moving.astype(np.int64), starts)
-        if (moves == 0).any():  # it may have walked away: then its place before is free now
+        if (moves == 0).any():  # it may be walking away: then the place that it left is free now
             left = self._vacated(low, seen_from, fresh)
             from_it = np.hypot(middle_x[:, None] - left[:, 1], middle_y[:, None] - left[:, 2])
             near = (from_it < LEFT_M) & (of[:, None] == left[:, 0])
@@ -262,7 +260,7 @@ class Tracker(Stateful):
         return found.at(few), fixed
 
     def _places(self, scan_m: F64, seen_from: F64, of: Bools) -> tuple[Ints, Ints, F64, F64]:
-        """Return robot, sector and place of the returns in range, of some of the robots."""
+        """Return robot, sector, x and y of the returns in range of robots selected by `of` (N,)."""
         robot, sector = np.nonzero((scan_m < RANGE_M) & of[:, None])
         distance, pose = scan_m[robot, sector], seen_from[robot]
         cos, sin = np.cos(seen_from[:, 2])[robot], np.sin(seen_from[:, 2])[robot]
@@ -274,7 +272,10 @@ class Tracker(Stateful):
     def _seen(
         self, robot: Ints, x: F64, y: F64, low: F64, high: F64, seen_from: F64
     ) -> tuple[F64, F64, F64]:
-        """Return the nearest and farthest return of scans toward places, and how far these are."""
+        """Return the nearest and farthest return of scans toward places, and the places' distance.
+
+        Each (P,), for places (P,) in the odometry frame.
+        """
         cos, sin = np.cos(seen_from[:, 2])[robot], np.sin(seen_from[:, 2])[robot]
         off_x, off_y = x - seen_from[robot, 0], y - seen_from[robot, 1]
         ahead = cos * off_x + sin * off_y - self.task.body.lidar_x_m
@@ -283,7 +284,7 @@ class Tracker(Stateful):
         return low[robot, sector], high[robot, sector], np.hypot(ahead, left)
 
     def _vacated(self, low: F64, seen_from: F64, fresh: Bools) -> F64:
-        """Return robot, x and y (V, 3) of what was there 1 s ago, and is seen through now."""
+        """Return robot, x and y (V, 3) of returns of 1 s ago that the current scan sees past."""
         robot, _, x, y = self._places(self.scan_m[-1], self.seen_from[-1], fresh)
         low_m, _, now_m = self._seen(robot, x, y, low, low, seen_from)
         gone = (low_m > now_m + FREE_M) & (low_m < np.inf)
@@ -303,7 +304,7 @@ class Tracker(Stateful):
         tracks[:, [_AGE, _MISSED, _STILL]] += dt[:, None]
 
     def _match(self, found: _Detections, still: F64, seen_from: F64) -> None:
-        """Correct tracks by the detections nearest to them, begin new ones, and drop the lost."""
+        """Correct tracks by the nearest detections, drop lost tracks, and add new ones."""
         tracks = self.tracks
         of = tracks[:, _ROBOT].astype(np.int64)
         gate = np.sqrt(np.maximum(tracks[:, _PR], tracks[:, _PT]))
@@ -325,7 +326,7 @@ class Tracker(Stateful):
             rows, things = np.array(pairs).T
             self._correct(rows, found, things)
         self._correct_standing(sorted(set(range(len(tracks))) - taken), still, seen_from)
-        # What is near a track is a part of it.
+        # Other detections near a track are part of the same object, and start no track.
         free = np.ones(len(found.robot), np.bool_)
         free[sorted(used)] = False
         if len(tracks):
@@ -361,12 +362,12 @@ class Tracker(Stateful):
         tracks[rows, _MISSED] = 0.0
         moves = found.moving[things] > 0
         tracks[rows[moves], _HITS] += 1
-        # Who walks away is always where a scan could not see before.
+        # Someone who walks away is always at a place that earlier scans could not see.
         moves |= ~found.still[things] & (np.hypot(speed_x, speed_y) > STANDING_MPS)
         tracks[rows[moves], _STILL] = 0.0
 
     def _correct_standing(self, rows: list[int], still: F64, seen_from: F64) -> None:
-        """Correct slow tracks that no detection matches by static returns: someone who stopped."""
+        """Correct unmatched slow tracks by static returns: these are people who stopped."""
         for row in rows:
             robot, x, y, vx, vy = self.tracks[row, :5].tolist()
             if not self.tracks[row, _SURE] or np.hypot(vx, vy) > STOPPED_MPS:
@@ -408,7 +409,7 @@ class Tracker(Stateful):
         self.tracks = np.concatenate([self.tracks, added])
 
     def _nearest(self) -> Signals:
-        """Return each robot's nearest confirmed tracks, in its own frame at the step."""
+        """Return each robot's nearest confirmed tracks (N, K), in its body frame at the step."""
         count = len(self.pose)
         signals = {name: np.full((count, self.count), np.nan) for name in TRACK_SIGNALS}
         tracks = self.tracks
@@ -440,7 +441,7 @@ _COS, _SIN = np.cos(_BEARINGS), np.sin(_BEARINGS)
 
 
 def _rates(now: Signals) -> F64:
-    """Return forward and sideways speed and yaw rate (n, 3) of robots."""
+    """Return forward and sideways speed and yaw rate of robots, (n, 3)."""
     wheels, localised = now["wheel_speed_mps"], now["localised_speed_mps"]
     lateral = now["localised_lateral_mps"]
     slips = np.abs(wheels - localised) > SLIP_MPS
@@ -450,7 +451,7 @@ def _rates(now: Signals) -> F64:
 
 
 def _moved(pose: F64, rates: F64, elapsed_s: NDArray[Any]) -> F64:
-    """Return poses (n, 3) after some time at these speeds, along the mean heading."""
+    """Return poses (n, 3) after `elapsed_s` at constant rates, moved along the mean heading."""
     forward, left, turn = (rates * elapsed_s[:, None]).T
     heading = pose[:, 2] + turn / 2
     cos, sin = np.cos(heading), np.sin(heading)
@@ -462,11 +463,11 @@ def _moved(pose: F64, rates: F64, elapsed_s: NDArray[Any]) -> F64:
 
 
 def _around(scan_m: F64) -> tuple[F64, F64]:
-    """Return the nearest and farthest return (N, SECTORS) within AROUND sectors of each."""
+    """Return the nearest and farthest return (N, SECTORS) within AROUND sectors of each sector."""
     padded = np.concatenate([scan_m[:, -AROUND:], scan_m, scan_m[:, :AROUND]], axis=1)
     low, high = padded, np.where(padded < np.inf, padded, -np.inf)
     width = 1
-    while width < 2 * AROUND + 1:  # of as many sectors, by two windows that overlap or touch
+    while width < 2 * AROUND + 1:  # widen the windows by joining two that overlap or touch
         step = min(width, 2 * AROUND + 1 - width)
         low = np.minimum(low[:, :-step], low[:, step:])
         high = np.maximum(high[:, :-step], high[:, step:])
