@@ -1,1 +1,1 @@
-"""A mixture and a store become a pinned set of packed rows."""
+"""Build panels: pinned sets of packed rows from a store and a mixture; sample their rows."""

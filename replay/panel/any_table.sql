@@ -1,7 +1,8 @@
--- A table of any task as rows of a store: what only a robot's log has is filled in. `given` is the table
--- with `place`, the number of each row; what it lacks of the first SELECT is null. An episode is in the
--- order of step_index, or of its rows. A row without next_observation takes the next step's observation;
--- of the last row of an episode none is known, and none is needed where it terminated.
+-- Converts a table of any task to rows of a store, with defaults for columns that only robot logs have.
+-- `given` is the table, with `place` the number of each row. Optional columns that it lacks are null.
+-- Steps of an episode are in the order of step_index, or else of rows. A row without next_observation
+-- takes the next step's observation. If there is no next step, it takes its own observation if it
+-- terminated (the value has no effect then), else null.
 CREATE TABLE filled AS
 WITH named AS (
     SELECT * REPLACE (terminated::BOOLEAN AS terminated, truncated::BOOLEAN AS truncated)

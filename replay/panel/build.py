@@ -1,4 +1,4 @@
-"""Build a panel: a plan's rows packed into one memory-mapped file, all or nothing."""
+"""Build a panel: pack a plan's rows into one file for memory-mapping, all or nothing."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ from restock.replay.plan.plan import AllStores, PanelPlan, PinnedStore, all_stor
 from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
-# What a panel is made of: what a table must have, whatever the mixture asks for.
+# Columns that a table must have for any mixture.
 _NEEDED = (
     *("transition_id", "recording_id", "episode_id", "episode_index", "step_index"),
     *("observation", "action", "reward", "next_observation", "terminated", "truncated"),
     *("primary_condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "stamp_ns", "pose_x_m", "pose_y_m", "task_hash"),
 )
-# The same of a table of any task, which has no episode_id; and what its rows may not be.
+# Columns that a table of any task must have. It is recognised by its lack of `episode_id`.
 _OF_ANY_TASK = (
     "observation",
     "action",
@@ -68,6 +68,7 @@ _OF_ANY_TASK = (
     "episode",
     "condition",
 )
+# Error message -> SQL predicate of `filled` for rows with this error.
 _FAULTS = {
     "row {row} lacks its observation, reward, end or episode": (
         "NOT coalesce(len(observation) > 0, false) OR reward IS NULL OR episode IS NULL"
@@ -85,22 +86,22 @@ _FAULTS = {
 
 @dataclass(frozen=True)
 class TransitionSource:
-    """Where transitions come from: a connection with a view `transitions`, and what it is."""
+    """A source of transitions: a connection with a view `transitions`, and its metadata."""
 
     connection: duckdb.DuckDBPyConnection
     name: str
     version: int
-    task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
-    conditions: tuple[Condition, ...]  # of both kinds
-    others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
+    task_json: Callable[[str], str]  # task hash -> the task as JSON; "" if unknown
+    conditions: tuple[Condition, ...]  # conditions and exposures
+    others: tuple[PinnedStore, ...] = ()  # other stores with rows in the view
     # task hash -> the profiles that read its rows, newest ingest first
     profiles: Callable[[str], list[StoredProfile]] = lambda task_hash: []
     corrected: tuple[str, ...] = ()  # versions of labels that people corrected
-    # Rows that are not in the view, by reason.
+    # Reason -> number of rows that are not in the view.
     left_out: Mapping[str, int] = field(default_factory=dict)
 
     def plan(self, mixture: Mixture) -> PanelPlan:
-        """Plan a mixture over it, see `plan_panel`."""
+        """Plan a mixture over these transitions; see `plan_panel`."""
         plan = plan_panel(self.connection, mixture, self.conditions, self.others)
         return replace(plan, left_out={**self.left_out, **plan.left_out})
 
@@ -114,14 +115,15 @@ def open_source(
     conditions: Sequence[Condition] | None = None,
     folder: Path | None = None,
 ) -> Iterator[TransitionSource]:
-    """Yield transitions as a source of a panel; see `build_panel` for what they may be.
+    """Open transitions as the source of a panel; see `build_panel` for their forms.
 
-    A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
-    Without `conditions` a table's are the shipped ones that its labels name.
+    For a store, the mixture's other stores are opened too; their relative paths are resolved
+    against `folder`. For a table without `conditions`, the conditions are those that its labels
+    name, with their shipped definitions if there are any.
 
     Raises:
-        StoreError: a file of a store is damaged: its page checksums are verified first; or a table
-            of any task is not what `build_panel` asks for.
+        StoreError: a file of a store is damaged (checksums are verified), or a table does not have
+            the form that `build_panel` needs.
     """
     where = "the table of transitions"
     if isinstance(transitions, str | Path):
@@ -158,7 +160,7 @@ def open_source(
         return
     with duckdb.connect() as connection:
         left_out = _register(connection, transitions, where)
-        # A store's Parquet and `transition_schema` say `condition`, its view `primary_condition`.
+        # In a store's Parquet, the column `primary_condition` of its view is named `condition`.
         has = [*map(str.casefold, connection.table("given").columns)]
         renamed = "" if "primary_condition" in has else "RENAME (condition AS primary_condition)"
         known, logged = ("EXCLUDE (logged_ns)", "logged_ns, ") if "logged_ns" in has else ("", "")
@@ -184,9 +186,10 @@ def open_source(
 
 
 def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str) -> dict[str, int]:
-    """Give a connection a table as `given`; return the rows that it leaves out, by reason.
+    """Register a table as `given`, filled in if it is of any task.
 
-    Raises ArgumentError, StoreError: it is not fit.
+    Returns reason -> number of rows left out. Raises ArgumentError or StoreError if columns are
+    missing or have other types.
     """
     remedy = "give rows as Store(…).sql('FROM transitions') has"
     try:
@@ -214,7 +217,7 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str
 def _fill(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, where: str, remedy: str
 ) -> dict[str, int]:
-    """Put rows as a store has them in place of `given`; return those left out, by reason."""
+    """Replace `given` by rows in the form of a store; return reason -> number of rows left out."""
     if not isinstance(table, pa.Table):  # a frame of pandas or Polars
         table = pa.table(table)
     connection.register("given", table.append_column("place", pa.array(np.arange(len(table)))))
@@ -241,7 +244,7 @@ def _fill(
 
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
-    """Return what the values of each column are, whatever their size."""
+    """Return each column's kind of values ("numbers", "text", …), ignoring their width."""
     return dict(zip(relation.columns, map(_kind, map(str, relation.types)), strict=True))
 
 
@@ -254,7 +257,7 @@ def _kind(kind: str) -> str:
 
 
 def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
-    """Return the conditions and exposures that labels name, shipped ones with their definition."""
+    """Return the conditions and exposures that labels name; shipped ones have their definition."""
     found = []
     columns: dict[str, Kind] = {"conditions": "outcome", "exposures": "exposure"}
     for column in columns.keys() & set(connection.sql("FROM transitions LIMIT 0").columns):
@@ -279,21 +282,22 @@ def build_panel(
     force: bool = False,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Panel:
-    """Plan, pack and open a panel; its `warnings` are those of `restock mix`.
+    """Plan, pack and open a panel. Its `warnings` are those of `restock mix`.
 
     Args:
         transitions: a store or its path; a table with the columns of a store's `transitions`; or a
-            table of any task, or its `.parquet` file: of each row its observation (a list), action
-            (from 0 on), reward, terminated, truncated, episode and condition ("nominal": none).
-        mixture: what to take, in which shares.
+            table of any task, also as a `.parquet` file, with columns observation (a list), action
+            (from 0), reward, terminated, truncated, episode and condition ("nominal" for none).
+        mixture: which rows to take, in which shares.
         out: the panel's directory, which must not exist yet.
-        task: for a table, the task its rows were made by.
-        conditions: for a table, the conditions that labelled it.
+        task: for a table, the task that defines its rows.
+        conditions: for a table, the definitions of its conditions.
         force: replace a panel that is already at `out`.
-        advance: called with the number of source rows read, as packing goes on.
+        advance: called repeatedly with the number of source rows just read.
 
     Raises:
-        ConfigError, MixtureError, StoreError: see `plan_panel`; also for arguments of other kinds.
+        ConfigError, MixtureError, StoreError: see `plan_panel`.
+        ArgumentError: an argument of a wrong type.
         PanelError: `out` already exists.
     """
     expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
@@ -308,10 +312,10 @@ def build_panel(
 
 
 def plan_only(store: str, name: str) -> PanelPlan:
-    """Return what a panel of a mixture, by its name or its file, would hold; nothing is written.
+    """Plan a panel from a mixture's name or file without writing anything.
 
     Raises:
-        StoreError, ConfigError, MixtureError: see `plan_panel`; those say which mixture it is.
+        StoreError, ConfigError, MixtureError: see `plan_panel`; the message names the mixture.
     """
     mixture = load_mixture(name)
     with Store(store) as opened:
@@ -331,10 +335,9 @@ def write_panel(
     force: bool = False,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Panel:
-    """Pack a plan's rows into `out`; an interruption leaves nothing there.
+    """Pack a plan's rows into `out`. If interrupted, it leaves nothing there.
 
-    Raises PanelError when something is at `out` that may not be replaced, or a row cannot be
-    packed.
+    Raises PanelError if something at `out` may not be replaced, or a row cannot be packed.
     """
     out = Path(out)
     check_free(out, force)
@@ -362,7 +365,7 @@ def write_panel(
 def _write_all(
     packer: Packer, folder: Path, advance: Callable[[int], None]
 ) -> tuple[int, FileRecord]:
-    """Write rows, and what stands beside them meanwhile; see `Packer.write_rows`."""
+    """Write the packed rows, and their metadata in a thread; see `Packer.write_rows`."""
     stop = Event()
     with ThreadPoolExecutor(1, "restock-meta") as beside:
         meta = beside.submit(packer.write_meta, folder / META, folder / EVALUATION_SPLIT, stop)
@@ -370,13 +373,13 @@ def _write_all(
             written = packer.write_rows(folder / ROWS, advance)
             meta.result()
         finally:
-            stop.set()  # where one of them failed: the other need not end
+            stop.set()  # if packing rows failed, metadata need not be completed
     return written
 
 
 @contextmanager
 def _enough_memory() -> Iterator[None]:
-    """Yield what DuckDB, or Arrow for it, says when it has too little. Raises PanelError."""
+    """Raise PanelError if DuckDB runs out of memory while the block runs."""
     try:
         yield
     except (duckdb.OutOfMemoryException, OSError) as error:
@@ -389,13 +392,13 @@ def _enough_memory() -> Iterator[None]:
 
 
 def _address(store: str) -> str:
-    """Return the absolute address of a store, so that a trace finds it from any folder."""
+    """Return the absolute path or URL of a store, so that a trace finds it from any folder."""
     place = Location.of(store)
     return str(place if place.folder is None else place.folder.resolve())
 
 
 def check_free(out: Path, force: bool) -> None:
-    """Raise PanelError if `out` is taken and may not be replaced, or no panel can be made there."""
+    """Raise PanelError if `out` exists and may not be replaced, or cannot be a directory."""
     expect_place(out, PanelError)
     is_panel = (out / HEADER).is_file()
     if out.exists() and not (force and is_panel):
@@ -415,18 +418,18 @@ def check_free(out: Path, force: bool) -> None:
 
 
 def _finish(path: Path) -> None:
-    """Flush a file to the disk, and take the right to write away: a panel never changes."""
+    """Flush a file to disk, and make it read-only: a panel never changes."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
     path.chmod(0o444)
 
 
 def _put(partial: Path, out: Path, force: bool) -> None:
-    """Give the finished panel its name, which takes one step, or two where it replaces another."""
-    partial.chmod(0o755)  # what mkdtemp makes is for its owner alone
+    """Rename the finished panel to `out`, after moving an old panel away if it is replaced."""
+    partial.chmod(0o755)  # mkdtemp lets only the owner in
     old = partial.with_name(partial.name + "-old")
     if force and (out / HEADER).is_file():
-        with contextlib.suppress(FileNotFoundError):  # taken away meanwhile
+        with contextlib.suppress(FileNotFoundError):  # another process removed it
             out.rename(old)
     try:
         partial.rename(out)
@@ -452,9 +455,9 @@ def _random_probability(task_json: str) -> float:
 def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
     """Return a panel's id: a hash of store versions, mixture, task, rows and packing version.
 
-    `digest` stands for the rows.
+    `digest` is a hash of the rows.
     """
-    own = source.name if source.version < 0 else source.version  # a table's names its content
+    own = source.name if source.version < 0 else source.version  # a table's name has a hash
     versions = [own, *(store.version for store in source.others)]
     named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()

@@ -1,12 +1,12 @@
-"""Draws from a panel by the mixture's shares, rules and limits, for any learner.
+"""Sample a panel's rows by the mixture's shares, rules and limits, for any learner.
 
     sampler = sampler_for(panel, 256, seed=0)
     batch = sampler.draw()                           # row numbers, strata, weights
     sampler.gather(batch.rows, out)                  # (B, W) float32
-    sampler.update(batch.rows, td_abs)               # once it was learnt from
+    sampler.update(batch.rows, td_abs)               # after the gradient step
 
-A stratum's rows are drawn by its `within`, weights are those of the shares in force, and no row
-comes more often than `max_replays_per_row`.
+A stratum's rows are drawn by its rule `within`. Importance weights follow the current shares. No
+row is drawn more often than `max_replays_per_row`.
 """
 
 from __future__ import annotations
@@ -40,23 +40,26 @@ if TYPE_CHECKING:
 class BatchDraw:
     """The logged rows of one batch."""
 
-    rows: Ints  # (L,) of the panel
+    rows: Ints  # (L,) row numbers in the panel
     strata: Ints  # (L,)
-    weight: F32 | None  # (L,) importance weights; None for ones
-    quota: F64  # (S,) the shares they were drawn by
+    weight: F32 | None  # (L,) importance weights; None: all 1
+    quota: F64  # (S,) shares by which they were drawn
 
 
 class LoggedSampler(Stateful):
-    """Draws of one learner from logged rows. `sampler_for` makes one for a panel.
+    """Samples logged rows for one learner. `sampler_for` builds one for a panel.
 
-    `controller` says in which shares; `sampler` draws by them; what would be drawn more often than
-    the mixture's `max_replays_per_row` is replaced by a row of the same stratum that may still be
-    drawn, else by one of another stratum, else by nothing.
+    `controller` sets the shares, and `sampler` draws by them. A row that was drawn
+    `max_replays_per_row` times is replaced by a row of the same stratum that may still be drawn,
+    else by a row of another stratum (offline only), else it is left out.
 
     Args:
+        controller: the current shares.
+        sampler: draws row numbers by these shares.
         rows: (n, W) the packed rows.
-        weights: importance weights of the rows: (n,), or those that follow the shares; None: ones.
-        rng: of the replacements.
+        stratum_rows: the row numbers of each stratum.
+        weights: importance weights: (n,), or weights that follow the shares; None: all 1.
+        rng: the generator for replacements.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("sampler", "controller", "replays", "replaced", "_rng")
@@ -73,16 +76,16 @@ class LoggedSampler(Stateful):
     ) -> None:
         self.controller, self.sampler = controller, sampler
         self._rows, self._stratum_rows, self._weights = rows, list(stratum_rows), weights
-        self.batch_size = sampler.batch_size  # of a draw that names no count
+        self.batch_size = sampler.batch_size  # used if `draw` gets no count
         if isinstance(weights, WeightsInForce):
             weights.set_shares(controller.shares)
-        # Draws of each row so far, where there is a limit to them.
+        # Draws of each row so far, if there is a limit.
         limit = controller.max_replays
         self.replays: NDArray[np.int32] | None = None
         if limit is not None:
             self.replays = np.zeros(len(rows), np.int32)
         self._budget: Ints = (limit or 0) * np.array([len(members) for members in stratum_rows])
-        # Rows of each stratum that were replaced, for the limit.
+        # Number of rows of each stratum that were replaced because of the limit.
         self.replaced: Ints = np.zeros(len(controller.shares), np.int64)
         self._rng = rng
 
@@ -96,12 +99,12 @@ class LoggedSampler(Stateful):
         return changed
 
     def replan(self, planned: PlannedDraws) -> None:
-        """Plan for other draws from the next batch on."""
+        """Plan for another number of draws from the next batch on."""
         if self.controller.replan(planned):
             self._follow()
 
     def draw(self, count: int | None = None) -> BatchDraw:
-        """Draw `count` rows for a batch, or fewer if no other row may be drawn again."""
+        """Draw `count` rows for a batch, or fewer if too few rows may still be drawn."""
         self.sampler.set_batch_size(self.batch_size if count is None else count)
         quota = self.controller.shares
         rows, strata = self.sampler.draw()
@@ -131,11 +134,11 @@ class LoggedSampler(Stateful):
 
     @property
     def needs_td(self) -> bool:
-        """Return whether draws follow the TD errors given to `update`."""
+        """Return whether draws depend on the TD errors given to `update`."""
         return self.sampler.follows_td
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take |TD error| (n,) of rows (n,) that were just learnt from."""
+        """Take |TD error| (n,) of rows (n,) that were just used in an update."""
         self.sampler.update(rows, td_abs)
 
     def _follow(self) -> None:
@@ -149,7 +152,7 @@ class LoggedSampler(Stateful):
     def _hold(
         self, rows: Ints, strata: Ints, weight: F32 | None, limit: int
     ) -> tuple[Ints, Ints, F32 | None]:
-        """Count the draws (L,), and replace those beyond the limit."""
+        """Count the drawn rows (L,), and replace those beyond the limit."""
         replays = self.replays
         if replays is None:
             raise RuntimeError("draws are not counted")
@@ -163,7 +166,7 @@ class LoggedSampler(Stateful):
             weight = weight.copy()
         for place in beyond.tolist():
             row, stratum = int(rows[place]), int(strata[place])
-            if replays[row] <= limit:  # another place of this batch gave way
+            if replays[row] <= limit:  # the row was replaced elsewhere in this batch
                 continue
             replays[row] -= 1
             self.replaced[stratum] += 1
@@ -178,16 +181,17 @@ class LoggedSampler(Stateful):
         return rows[kept], strata[kept], None if weight is None else weight[kept]
 
     def _replacement(self, stratum: int, limit: int) -> tuple[int, int] | None:
-        """Return a row that may still be drawn and its stratum; None if there is none.
+        """Return a row that may still be drawn, and its stratum; None if there is none.
 
-        The given stratum is tried first, then the others at random by their shares (offline only).
+        It tries the given stratum first, then (offline only) the others in random order, weighted
+        by share.
         """
         replays, shares = self.replays, self.controller.shares
         if replays is None:
             return None
         others = self._rng.permutation(len(shares))
         by_share = sorted(others.tolist(), key=lambda s: -shares[s] * self._rng.random())
-        if self.controller.online:  # the ring gives the others
+        if self.controller.online:  # the ring replaces missing rows
             by_share = []
         for code in [stratum, *by_share]:
             members = self._stratum_rows[code]
@@ -197,12 +201,12 @@ class LoggedSampler(Stateful):
         return None
 
     def _used_up(self) -> bool:
-        """Return whether a stratum that has a share has no row left that may be drawn."""
+        """Return whether a stratum with a share has used up all its draws."""
         controller, full = self.controller, self.controller.drawn >= self._budget
         return bool(controller.shares[full].any()) and controller.logs_share > 0
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return a row a stratum, for the run's table `shares`."""
+        """Return one dict per stratum, for the run's table `shares`."""
         replays = self.replays
         rows = self.controller.describe()
         for index, (row, members) in enumerate(zip(rows, self._stratum_rows, strict=True)):
@@ -220,18 +224,19 @@ def sampler_for(
     logs_share: float | None = None,
     fresh: Bools | None = None,
 ) -> LoggedSampler:
-    """Return the sampler that draws from a panel as its mixture says.
+    """Build a sampler that draws from a panel by its mixture.
 
     Args:
+        panel: the panel.
         batch_size: logged rows of a batch.
-        seed: of the draws: an integer of at least 0, or several.
-        planned: what will be drawn, which `max_replays_per_row` is shared out by; default: what the
-            mixture says by `planned_draws`.
-        logs_share: of an online batch, in place of the mixture's.
-        fresh: (S,) which strata rows of a ring beside the panel can be in; None: there is no ring.
+        seed: seed of the draws: an integer of at least 0, or several.
+        planned: number of draws, over which `max_replays_per_row` is spread; default: the
+            mixture's `planned_draws`.
+        logs_share: share of logged rows in an online batch; default: the mixture's.
+        fresh: (S,) strata that rows of a fresh ring can be in; None: there is no ring.
 
     Raises:
-        MixtureError: rows too few for what is planned, where the mixture refuses that.
+        MixtureError: too few rows for the planned draws, if the mixture refuses that.
     """
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
@@ -268,7 +273,7 @@ def sampler_by_shares(
     logs_share: float,
     weights: F32 | None = None,
 ) -> LoggedSampler:
-    """Build a sampler over rows (n, W) that belong to no panel, with fixed shares (S,).
+    """Build a sampler over rows (n, W) that are not from a panel, with fixed shares (S,).
 
     Each stratum is drawn without replacement.
     """
@@ -292,7 +297,7 @@ def sampler_by_shares(
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
-    """Return the draws that a mixture was planned for."""
+    """Return the draws that a mixture's `planned_draws` stands for."""
     return PlannedDraws(online=float(mixture.planned_draws))
 
 
@@ -302,7 +307,7 @@ def controller_for(
     logs_share: float | None = None,
     fresh: Bools | None = None,
 ) -> ShareController:
-    """Return the shares of a learner that draws so much from a panel.
+    """Build the controller of shares for the `planned` draws from a panel.
 
     Raises:
         MixtureError: see `ShareController`.
@@ -325,7 +330,7 @@ def controller_for(
 
 
 def _weights(panel: Panel) -> WeightsInForce | F32 | None:
-    """Return the weights of a panel's rows, or None where none is corrected."""
+    """Return the weights of a panel's rows; None if all are 1."""
     strata = panel.strata
     if all(stratum.correction == "none" for stratum in strata):
         weights = panel.weights

@@ -1,8 +1,7 @@
-"""`mixture(name)` and `mixture_rows(name)`: a plan as tables of a store's SQL.
+"""`mixture(name)` and `mixture_rows(name)`: plans as table macros in a store's SQL.
 
-A plan is Python (its draws and splits are hashes of our own), so the macros call functions of the
-connection. These plan on a store of their own, at the same version: a query that runs cannot ask
-its own connection.
+Plans are computed in Python, so the macros call Python functions. These open the same version of
+the store again, because a running query cannot use its own connection.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from restock.replay.store.store import Store
 if TYPE_CHECKING:
     from restock.replay.plan.plan import PanelPlan
 
-# Columns of `mixture`, with their types; each is of `Stratum`, two under the names that a run uses.
+# Columns of `mixture` and their types: fields of `Stratum`, two of them renamed as in runs.
 STRATA = {
     "stratum": "VARCHAR",
     "source": "VARCHAR",
@@ -57,11 +56,11 @@ _ARROW = {
     "FLOAT": pa.float32(),
 }
 T = TypeVar("T")
-_RENAMED = {"stratum": "name", "drawn_share": "share"}  # to the fields of `Stratum`
+_RENAMED = {"stratum": "name", "drawn_share": "share"}  # column -> field of `Stratum`
 
 
 def install_mixtures(store: Store) -> None:
-    """Make both macros in a store's connection."""
+    """Create both macros in a store's connection."""
     tables = {"planned_strata": (STRATA, strata_table), "planned_rows": (ROWS, rows_table)}
     script = files("restock.replay.panel") / "mixture_tables.sql"
     install_planned(store, ("mixture", "mixture_rows"), tables, script, _plan)
@@ -83,12 +82,14 @@ def install_planned(
     script: Traversable,
     plan: Callable[[Store, str], T],
 ) -> None:
-    """Make macros in a store's connection whose rows come from a plan in Python.
+    """Create macros in a store's connection whose rows come from a plan in Python.
 
     Args:
-        macros: their names, each of which takes the name of a mixture.
-        tables: the SQL functions that `script` calls: their columns, and a plan as such a table.
-        plan: makes a plan on a store of its own, at the same version, for a mixture's name.
+        store: the store.
+        macros: names of the macros; each takes the name of a mixture.
+        tables: SQL function that `script` calls -> its columns, and what turns a plan into a table.
+        script: the SQL that creates the macros.
+        plan: plans a mixture, given its name and a second `Store` of the same version.
     """
     limit = store.bare.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
     path, version = store.path, store.version
@@ -105,9 +106,9 @@ def install_planned(
 
 
 def _check_names(macros: Sequence[str], text: str) -> None:
-    """Raise ConfigError if a query asks one of these macros for a mixture that cannot be read.
+    """Raise ConfigError if a query calls one of these macros with a mixture that cannot be read.
 
-    DuckDB calls a function when rows are fetched, and reports what it raised in its own words.
+    Otherwise the error would come when rows are fetched, wrapped by DuckDB.
     """
     from restock.replay.mixture.mixture import load_mixture
 
@@ -122,9 +123,9 @@ def _install_function(
     table_of: Callable[[T], pa.Table],
     planned: Callable[[str, int], T],
 ) -> None:
-    """Install a SQL function that maps mixture names to lists of structs, one per row.
+    """Install a SQL function that maps mixture names to lists of structs, one struct per row.
 
-    `planned` gets a name and when its file was last written, in ns (0 of a shipped mixture).
+    `planned` gets a name and the modification time of its file in ns (0 for a shipped mixture).
     """
     schema = pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
 
@@ -143,7 +144,7 @@ def _install_function(
         return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), structs)
 
     fields = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
-    # Without "side effects" the optimiser would make one constant of all rows.
+    # Declared to have side effects so that the optimiser does not fold it into a constant.
     connection.create_function(
         function,
         lists,
@@ -155,20 +156,20 @@ def _install_function(
 
 
 def _changed_ns(name: str) -> int:
-    """Return when a mixture's file was last written; a change makes it planned again."""
+    """Return the modification time of a mixture's file, so that a changed file is planned again."""
     path = Path(name)
     return path.stat().st_mtime_ns if path.is_file() else 0
 
 
 def strata_table(plan: PanelPlan) -> pa.Table:
-    """Return the strata of a plan, columns STRATA."""
+    """Return the strata of a plan, with columns STRATA."""
     return pa.table(
         {name: [getattr(line, _RENAMED.get(name, name)) for line in plan.strata] for name in STRATA}
     )
 
 
 def rows_table(plan: PanelPlan) -> pa.Table:
-    """Return the rows that a plan packs, in their order, columns ROWS."""
+    """Return the rows that a plan packs, in order, with columns ROWS."""
     rows = plan.rows.take(pa.array(plan.panel_rows))
     code = pa.array(plan.stratum[plan.panel_rows])
     return pa.table(

@@ -1,21 +1,20 @@
-"""Packing: a plan's rows into one file of float32 rows, with metadata beside, in bounded memory.
+"""Pack a plan's rows into a file of float32 rows and a table of metadata, in bounded memory.
 
-Whatever the size of the store, memory holds the plan, a batch and some blocks of packed rows.
-Observations are read in the order of the files and put at their places, because sorting rows this
-wide would first spill all of them to disk. A recording's rows are together in both orders, so a
-block is full soon after it was begun. A block that is full is written by other threads, while the
-next ones are filled.
+For a store of any size, memory holds only the plan, a batch and some blocks of packed rows.
+Observations are read in the order of the files and written to their places, because sorting such
+wide rows would spill all of them to disk first. The rows of a recording are adjacent in both
+orders, so a block is soon full. Other threads write full blocks while the next ones are filled.
 
 An n-step return of step t uses the rewards of [t, t + n) and bootstraps from the state at t + n. It
-is cut where the episode ends, where a step is missing, and before an off-policy action: step j's
-action is no part of the return of an earlier step where
+is cut where the episode ends, where a step is missing, and before an off-policy action: the action
+of step j ends the returns of earlier steps if
 
-- another behaviour policy (or version) chose it than the step before: a handover;
-- its policy thought it less likely than chance (below 1 / number of actions): it explored.
+- another behaviour policy (or version) than in the step before chose it (a handover);
+- its policy gave it less than chance, 1 / number of actions (exploration).
 
-Such a cut looks at the action of j, which is chosen at the state that the return then bootstraps
-from: given that state it is independent of the rewards before it, so the cut adds no bias (it is
-the cut of Watkins's Q(lambda), 1989). It never looks at a reward or a state after j.
+Such a cut depends on the action of j, which is chosen in the state from which the return then
+bootstraps. Given that state, the action is independent of the rewards before it, so the cut adds no
+bias (it is the cut of Watkins's Q(lambda), 1989). It never depends on a reward or a state after j.
 """
 
 from __future__ import annotations
@@ -46,36 +45,36 @@ from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import row_columns, row_width
 
-BLOCK_ROWS = 512  # of packed rows, written together
-HELD_BYTES = 128 << 20  # of blocks that are not full, in memory at a time
+BLOCK_ROWS = 512  # packed rows written together
+HELD_BYTES = 128 << 20  # largest size of unfinished blocks in memory
 WRITERS = 2  # threads
-WAITING_BYTES = 32 << 20  # of blocks that are being written, in memory at a time
+WAITING_BYTES = 32 << 20  # largest size of full blocks that wait to be written
 
 
 class Values(NamedTuple):
-    """What rows (m,) have in some of their columns."""
+    """Values of some columns for rows (m,)."""
 
     columns: slice
     held: NDArray[Any]  # (m, c), or (n, c) with `of`
-    of: Ints | None = None  # (m,) which of these each row has
+    of: Ints | None = None  # (m,) index into `held` for each row
 
 
 class PackedFile:
-    """Rows (n, W) float32 of a file, put there part by part, in any order, each part once.
+    """Writes a file of rows (n, W) float32; parts of rows come in any order, each part once.
 
-    Blocks are written when they are full; those that wait for the rest of their rows are held, and
-    where they are too many, written as they are and read again. Use it as a context: leaving it
-    waits for what is being written.
+    Blocks are written when they are full. Unfinished blocks stay in memory; if there are too many,
+    the oldest are written and later read back. Use it as a context manager, which waits for pending
+    writes at the end.
     """
 
     def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
         self._rows, self._width, self._parts = rows, width, parts
         self._path = path
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts of rows, of each block
+        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts received, by block
         self._held: dict[int, F32] = {}
         self._writers = ThreadPoolExecutor(WRITERS, "restock-pack")
-        self._writing: dict[int, Future[None]] = {}  # by block, the oldest first
+        self._writing: dict[int, Future[None]] = {}  # by block, oldest first
 
     def __enter__(self) -> PackedFile:
         return self
@@ -85,10 +84,10 @@ class PackedFile:
         os.close(self._file)
 
     def finish(self) -> FileRecord:
-        """Wait for what is being written; size and checksums of the file.
+        """Wait for pending writes; return the size and checksums of the file.
 
         Raises:
-            PanelError: a part of a row was not put.
+            PanelError: a part of a row is missing.
         """
         self._wait(at_most=0)
         if int(self._put.sum()) != self._rows * self._parts:
@@ -96,9 +95,9 @@ class PackedFile:
         return FileRecord.of(self._path)
 
     def put(self, rows: Ints, *values: Values) -> None:
-        """Write some columns of some rows (m,).
+        """Set some columns of rows (m,).
 
-        Raises OSError where the file cannot be written.
+        Raises OSError if the file cannot be written.
         """
         if (np.diff(rows) < 0).any():
             order = np.argsort(rows, kind="stable")
@@ -147,19 +146,19 @@ class PackedFile:
         self._writing[number] = self._writers.submit(self._store, number, held)
 
     def _wait(self, at_most: int) -> None:
-        """Wait until all writes have ended, and raise their errors."""
+        """Wait until at most so many writes are pending, and raise the errors of finished ones."""
         while len(self._writing) > at_most:
             self._writing.pop(next(iter(self._writing))).result()
 
     def _store(self, number: int, held: F32) -> None:
         rest, place = held.data.cast("B"), number * self._block_bytes
-        while rest:  # a full disk is an OSError; what is written short goes on
+        while rest:  # a short write continues here; a full disk raises OSError
             written = os.pwrite(self._file, rest, place)
             rest, place = rest[written:], place + written
 
 
 def _read_into(out: F32, file: int, at: int) -> bool:
-    """Fill `out` with what a file has from byte `at` on; False where it ends before that."""
+    """Fill `out` with the bytes of a file from `at` on; return False if the file is too short."""
     rest = out.data.cast("B")
     while rest:
         got = os.preadv(file, [rest], at)
@@ -170,17 +169,14 @@ def _read_into(out: F32, file: int, at: int) -> bool:
 
 
 class _Stretches:
-    """Parts of a list of row numbers (m,), as slices if the numbers are consecutive.
-
-    Slices copy faster.
-    """
+    """Ranges of row numbers (m,), as slices if the numbers are consecutive: slices copy faster."""
 
     def __init__(self, rows: Ints) -> None:
         self._rows = rows
-        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # up to each
+        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # number of breaks before each
 
     def __call__(self, begin: int, end: int, base: int = 0) -> Ints | slice:
-        """Return the row numbers [begin, end) less `base`."""
+        """Return the row numbers at [begin, end), minus `base`."""
         if self._breaks[begin] != self._breaks[end - 1]:
             return self._rows[begin:end] - base
         first = int(self._rows[begin]) - base
@@ -188,12 +184,12 @@ class _Stretches:
 
 
 ROW_GROUP_ROWS = 65_536
-BATCH_BYTES = 4 << 20  # of observations, in memory at a time
+BATCH_BYTES = 4 << 20  # largest size of a batch of observations
 FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
     ' + reward)"'
 )
-# Of these hardly two rows have the same.
+# Columns with few repeated values.
 _NO_DICTIONARY = ("transition_id", "stamp_ns", "logged_ns", "reward")
 _SPLIT_COLUMNS = (
     "transition_id",
@@ -208,13 +204,14 @@ _SPLIT_COLUMNS = (
 
 
 def going_on(rows: pa.Table, random_probability: float) -> Bools:
-    """Return whether the next row is part of what a row's return may sum over, (N,).
+    """Return whether a row's n-step return may go on to the next row, (N,).
 
-    It is if it is the next step of the same episode, and the same policy chose its action without
-    exploring. `rows` (N) are META_COLUMNS in order. `random_probability` is that of an action
-    chosen blindly; below it a policy explores. 0: unknown.
+    It may if that row is the next step of the same episode, and the same policy chose its action
+    without exploring. `rows` (N) are META_COLUMNS in order. `random_probability` is an action's
+    probability under random choice: an action less likely than this counts as exploration. 0 means
+    that it is unknown.
     """
-    # A row without a version is of the version "" of its policy.
+    # A missing version counts as version "" of its policy.
     version = pc.coalesce(rows["behaviour_version"].cast(pa.string()), "")
     version = version.combine_chunks().dictionary_encode()
     policy = codes(rows, "behaviour_policy").astype(np.int64)
@@ -231,12 +228,12 @@ def going_on(rows: pa.Table, random_probability: float) -> Bools:
 def n_step_horizon(continues: Bools, n_step: int) -> Ints:
     """Return how many steps each row's return spans, (N,) in 1..n_step.
 
-    `continues` (N,) is as `going_on` gives it.
+    `continues` (N,) comes from `going_on`.
     """
     horizon = np.ones(len(continues), np.int64)
     unbroken = np.ones(len(continues), np.bool_)
     for ahead in range(1, min(n_step, len(continues) + 1)):
-        # Row i reaches i + ahead if it reached i + ahead - 1 and that one continues.
+        # Row i reaches i + ahead if it reaches i + ahead - 1 and that row continues.
         step = np.zeros(len(continues), np.bool_)
         step[: len(continues) - ahead + 1] = continues[ahead - 1 :]
         unbroken &= step
@@ -245,7 +242,7 @@ def n_step_horizon(continues: Bools, n_step: int) -> Ints:
 
 
 class Packer:
-    """Packs one plan; `random_probability` as `going_on` takes it."""
+    """Packs the rows of one plan; `random_probability` as in `going_on`."""
 
     def __init__(
         self,
@@ -260,12 +257,12 @@ class Packer:
         self._ids: Ints = plan.rows["transition_id"].to_numpy()
         self._reward: F32 = plan.rows["reward"].to_numpy()
         count = len(plan.weight)
-        # Of each packed row: its place in the source, and that of the last step of its return.
+        # For each packed row: its position in the source, and that of its return's last step.
         self.chosen: Ints = np.memmap(scratch / "chosen", np.int64, "w+", shape=(count,))
         self.last: Ints = np.memmap(scratch / "last", np.int64, "w+", shape=(count,))
         at = 0
         for begin, end, rows in self._stretches():
-            # With the rows behind, as far as a return can reach.
+            # Includes the following rows that a return can reach.
             part = plan.rows.slice(begin, end - begin + self.mixture.n_step)
             horizon = n_step_horizon(going_on(part, random_probability), self.mixture.n_step)[rows]
             self.chosen[at : at + len(rows)] = begin + rows
@@ -273,7 +270,7 @@ class Packer:
             at += len(rows)
 
     def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
-        """Yield stretches of the source, and which of their rows are packed."""
+        """Yield ranges of the source's rows, and which rows in each are packed."""
         for begin, end in stretches(len(self.plan.rows)):
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 
@@ -298,9 +295,10 @@ class Packer:
         return hashlib.blake2b(b"".join(d.digest() for d in digests), digest_size=8).hexdigest()
 
     def write_rows(self, path: Path, advance: Callable[[int], None]) -> tuple[int, FileRecord]:
-        """Write the packed rows; returns the observation size, and the file's record.
+        """Write the packed rows; return the observation size, and the file's record.
 
-        Raises PanelError where an observation or reward is not finite, or of another size.
+        Raises PanelError if an observation or reward is not finite, or an observation has another
+        size.
         """
         of_task = f"FROM {as_stored(self.connection)} WHERE task_hash = '{self.plan.task_hash}'"
         first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
@@ -309,10 +307,10 @@ class Packer:
         names = "transition_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
         places = Places(self._ids)
-        # Two halves of a row: what is observed and done, and what comes of it.
+        # Two parts of a row: observation, action and reward; next observation and discount.
         with (
             PackedFile(path, len(self.chosen), row_width(size), parts=2) as rows,
-            any_order(self.connection),  # each row knows where it belongs
+            any_order(self.connection),  # each row's place follows from its id
         ):
             for batch in filter(len, self.connection.sql(query).to_arrow_reader(at_a_time)):
                 place = places.of(batch.column("transition_id").to_numpy())
@@ -321,10 +319,10 @@ class Packer:
             return size, rows.finish()
 
     def _write(self, rows: PackedFile, size: int, batch: pa.RecordBatch, place: Ints) -> None:
-        """Put a batch's values where they belong."""
+        """Write a batch's values to the packed rows that use them."""
         part = row_columns(size)
         target, behind = _between(self.chosen, place)
-        packed = np.flatnonzero(behind > target)  # those that are there
+        packed = np.flatnonzero(behind > target)  # rows of the batch that are packed
         target = target[packed]
         observation = matrix(batch.column("observation"), size)
         next_observation = matrix(batch.column("next_observation"), size)
@@ -340,7 +338,7 @@ class Packer:
             Values(part["action"], batch.column("action").to_numpy()[:, None], packed),
             Values(part["reward"], returns[:, None], packed),
         )
-        # Returns that end with a row of this batch take its next observation.
+        # Packed rows whose return ends with a row of this batch take its next observation.
         first, behind = _between(self.last, place)
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
@@ -366,15 +364,12 @@ class Packer:
             )
 
     def write_meta(self, meta: Path, evaluation_split: Path, stop: Event) -> None:
-        """Write the metadata of the rows, and the evaluation split, in the same order.
-
-        Writing ends early if `stop` is set.
-        """
+        """Write the metadata of packed rows, and the evaluation split, in order; until `stop`."""
         held = np.flatnonzero(self.plan.evaluation_split)
         with _writer(evaluation_split) as write:
             for begin in _groups(len(held), stop):
                 part = self.plan.rows.select(_SPLIT_COLUMNS).take(pa.array(held[begin]))
-                # For the audit `leakage`.
+                # Used by the audit `leakage`.
                 split_by = pa.array([self.plan.split_by], pa.string())
                 column = pa.DictionaryArray.from_arrays(np.zeros(len(part), np.int8), split_by)
                 write(part.append_column("split_by", column))
@@ -405,7 +400,7 @@ def _groups(rows: int, stop: Event) -> Iterator[slice]:
 
 @contextmanager
 def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
-    """Write a Parquet file, a row group at a time."""
+    """Yield a function that appends a row group to a Parquet file."""
     made: list[pq.ParquetWriter] = []
 
     def write(rows: pa.Table) -> None:
@@ -427,7 +422,7 @@ def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
 
 
 def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
-    """Text as codes of what these rows have alone: readers keep them so."""
+    """Reduce a dictionary to the values that occur, sorted: readers keep the whole dictionary."""
     used = column.indices.unique().drop_null()
     order = used.take(pc.array_sort_indices(used))
     codes = pc.index_in(column.indices, value_set=order)
@@ -435,13 +430,13 @@ def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
 
 
 def _finite(values: NDArray[np.float32], rows: Ints) -> bool:
-    """Return whether there is neither NaN nor infinity in these rows (n,) of (m, c)."""
+    """Return whether values (m, c) are finite in these rows (n,)."""
     return bool(np.isfinite(values).all() or np.isfinite(values[rows]).all())
 
 
 def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
-    """Return the begin and end of each of these values (n,) in an ascending array."""
-    # Those of one batch mostly lie together: the part of the array that may have them is small.
+    """Return begin and end of each value's range in an ascending array, (n,) each."""
+    # Values of one batch are mostly close together, so only a small part is searched.
     low, high = np.searchsorted(ascending, [values.min(), values.max() + 1])
     near = np.asarray(ascending[low:high])
     begin, end = (low + np.searchsorted(near, values, side) for side in ("left", "right"))
@@ -449,5 +444,5 @@ def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
 
 
 def _starts(counts: Ints) -> Ints:
-    """Return where each of consecutive groups of these sizes begins."""
+    """Return the begin of each of consecutive groups with these sizes."""
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)

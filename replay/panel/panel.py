@@ -1,11 +1,11 @@
 """The panel: the pinned, memory-mapped set of transitions a run samples from.
 
-A directory that never changes once it is there:
+A panel is a directory that never changes after it was built:
 
-    panel.json       what it was made from, its strata, sizes and checksums
-    rows.f32         packed float32 rows, little-endian, as `replay.sampling.packed_rows` says
-    meta.parquet     one row beside each packed row: ids, condition, behaviour policy, weight, …
-    evaluation_split.parquet the transitions that were kept out, by whole episodes
+    panel.json       its source, mixture, strata, and sizes and checksums of files
+    rows.f32         packed float32 rows, little-endian (layout: `replay.sampling.packed_rows`)
+    meta.parquet     one row per packed row: ids, condition, behaviour policy, weight, …
+    evaluation_split.parquet the transitions held out for evaluation
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ READ_BYTES = 4 << 20
 
 
 class FileRecord(msgspec.Struct, frozen=True):
-    """Size and checksums of one file, when it was written."""
+    """Size and checksums of a file when it was written."""
 
     bytes: int
-    blake3: str  # of all of it
-    sample: str  # of some blocks of it
+    blake3: str  # of the whole file
+    sample: str  # of some of its blocks
 
     @classmethod
     def of(cls, path: Path) -> FileRecord:
-        """Return the record of a file as it is now."""
+        """Measure a file."""
         return cls(path.stat().st_size, checksum(path), sample_checksum(path))
 
     def check(self, path: Path, *, verify: bool) -> None:
-        """Raise PanelError where the file is not as it was written."""
+        """Raise PanelError if the file changed; the whole-file checksum needs `verify`."""
         if sys.byteorder != "little":
             raise PanelError("panels need a little-endian machine", where=str(path))
         if not path.is_file():
@@ -75,7 +75,7 @@ class FileRecord(msgspec.Struct, frozen=True):
 
 
 def checksum(path: Path) -> str:
-    """Compute the BLAKE3 of a file, 32 hex digits, by as many threads as there are processors."""
+    """Compute the BLAKE3 of a file, 32 hex digits, with one thread per processor."""
     digest = blake3(max_threads=blake3.AUTO)
     with path.open("rb") as file:
         while content := file.read(READ_BYTES):
@@ -84,7 +84,7 @@ def checksum(path: Path) -> str:
 
 
 def sample_checksum(path: Path) -> str:
-    """Return blake2b of evenly spread blocks of a file, first and last included, 32 hex digits."""
+    """Return the BLAKE2b of evenly spaced blocks of a file, including both ends, 32 hex digits."""
     digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
     room = max(path.stat().st_size - BLOCK_BYTES, 0)
     with path.open("rb") as file:
@@ -98,7 +98,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 def seal(header: msgspec.Struct) -> bytes:
-    """Return a header as indented JSON, with a checksum over its values."""
+    """Encode a header as indented JSON, with a checksum over its values."""
     values = msgspec.to_builtins(header)
     return msgspec.json.format(msgspec.json.encode(values | {"seal": _seal_of(values)}), indent=1)
 
@@ -108,7 +108,7 @@ class _Version(msgspec.Struct):
 
 
 def packed_by(content: bytes) -> int | None:
-    """Return the version of the packing that a header names; None where there is none to read."""
+    """Return the packing version in a header; None if it cannot be read."""
     try:
         return msgspec.json.decode(content, type=_Version).packing_version
     except (msgspec.DecodeError, ValueError):
@@ -116,7 +116,7 @@ def packed_by(content: bytes) -> int | None:
 
 
 def unseal(content: bytes, kind: type[T], where: Path) -> T:
-    """Return what `seal` was given. Raises PanelError for what is no such header, or was edited."""
+    """Decode a header from `seal`. Raises PanelError if it is damaged or was edited."""
     try:
         values = msgspec.json.decode(content, type=dict[str, Any])
         given_seal = values.pop("seal", None)
@@ -150,13 +150,13 @@ HEADER, ROWS, META, EVALUATION_SPLIT = (
 
 
 class Header(msgspec.Struct, frozen=True):
-    """panel.json."""
+    """The contents of panel.json."""
 
     id: str
-    store: str  # its absolute path
+    store: str  # its absolute path or URL; for a table in memory, a name with a hash
     store_version: int  # of the store's Delta table; -1 for a table in memory
     task_hash: str
-    task_json: str  # "" where the source did not say
+    task_json: str  # "" if unknown
     labels_version: str
     observation_size: int
     rows: int
@@ -164,29 +164,29 @@ class Header(msgspec.Struct, frozen=True):
     n_step: int
     packing_version: int
     restock_version: str
-    newest_ns: int  # when its newest row was logged
-    logs_share: float  # of a batch
+    newest_ns: int  # when the source's newest row was logged
+    logs_share: float  # share of logged rows in a batch
     conditions: list[str]  # by priority, nominal last
-    left_out: dict[str, int]  # rows of the source that are not in the panel, by reason
-    effective_rows: float  # rows drawn equally often that the weighted draw is worth
+    left_out: dict[str, int]  # reason -> rows of the source that are not in the panel
+    effective_rows: float  # effective sample size of the weighted draws
     strata: list[Stratum]
     mixture: Mixture
     others: list[PinnedStore]  # stores besides the first
-    ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
+    ratios: list[RatioFit]  # fits of density ratios, if a correction uses them
     files: dict[str, FileRecord]
-    profile: str = ""  # the name of the one that read its rows; "" where the source did not say
-    profile_toml: str = ""  # its text, for who has not its file; "" where the source did not say
-    as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
-    split_by: str = ""  # what the evaluation split is of; "": as its mixture says
-    split_note: str = ""  # of a split within episodes, or of none for want of time
-    warnings: list[str] = []  # what `restock mix` warned of
+    profile: str = ""  # name of the profile that read its rows; "" if unknown
+    profile_toml: str = ""  # text of that profile, in case its file is missing; "" if unknown
+    as_of_ns: int | None = None  # date for ages; None without max_age_days in the mixture
+    split_by: str = ""  # what the evaluation split did; "": as its mixture says
+    split_note: str = ""  # what was held out instead of whole groups, or why nothing was
+    warnings: list[str] = []  # the warnings of `restock mix`
 
 
 class Panel:
     """A panel on disk, open for reading. Use `Panel.open(path)`.
 
-    `rows` (n, W) float32 is memory-mapped and read-only; `columns` says where each part of a row
-    is; `meta` (n rows) stands beside it.
+    `rows` (n, W) float32 is memory-mapped and read-only. `columns` maps each part of a row to its
+    columns. `meta` is a table of n rows of metadata.
     """
 
     def __init__(self, path: Path, header: Header, rows: NDArray[np.float32]) -> None:
@@ -196,10 +196,10 @@ class Panel:
 
     @classmethod
     def open(cls, path: str | Path, *, verify: bool = False) -> Panel:
-        """Open a panel; sizes are checked always, checksums with `verify`.
+        """Open a panel. It checks sizes and samples of files, and whole files with `verify`.
 
         Raises:
-            PanelError: no panel, a damaged one, or one packed by another version.
+            PanelError: not a panel, a damaged one, or one packed by another version.
         """
         path = Path(path)
         if not (path / HEADER).is_file():
@@ -249,7 +249,7 @@ class Panel:
 
     @property
     def task(self) -> Task:
-        """Return the task that made these rows; raise PanelError if the source did not say."""
+        """Return the task that defines these rows; raise PanelError if it is unknown."""
         if not self.header.task_json:
             raise PanelError("it does not contain its task", where=str(self.path))
         try:
@@ -271,7 +271,7 @@ class Panel:
 
     @property
     def splits(self) -> bool:
-        """Return whether anything was kept out of it, to evaluate on."""
+        """Return whether rows were held out for evaluation."""
         return (self.header.split_by or self.header.mixture.evaluation_split.by) != "none"
 
     @property
@@ -286,8 +286,7 @@ class Panel:
     def warnings(self) -> list[str]:
         """Return the warnings of `restock mix`.
 
-        It warns of a source that may be an archive, or a split that holds out far more than
-        requested.
+        For example: a source may be an archive, or the split holds out far more than requested.
         """
         return self.header.warnings
 
@@ -297,9 +296,9 @@ class Panel:
 
         Columns: transition_id, recording_id, episode_id, step_index, stamp_ns, logged_ns,
         condition, zone, behaviour_policy, behaviour_version, action_probability, action, reward (of
-        one step), terminated, truncated, perturbation, stratum, stratum_code (its index in
-        `strata`), horizon, weight. If shares move: what their weights need (state_code,
-        probability_of_…).
+        one step), terminated, truncated, perturbation, robot, site, state_code, probability_of_…
+        (to compute weights for other shares), stratum, stratum_code (its index in `strata`),
+        horizon, weight.
         """
         if self._meta is None:
             self._meta = self._read(META).unify_dictionaries()
@@ -313,7 +312,7 @@ class Panel:
         """
         try:
             table = self._read(META, [name]) if self._meta is None else self._meta
-        except PanelError:  # it has no such column, or is damaged: then this raises again
+        except PanelError:  # no such column, or a damaged file, for which this raises again
             table = self.meta
         if name not in table.column_names:
             has = ", ".join(self.meta.column_names)
@@ -322,17 +321,17 @@ class Panel:
         return np.asarray(table[name].to_numpy())
 
     def _read(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Raise PanelError where the file is damaged."""
+        """Read a table of the panel; raise PanelError if it is damaged."""
         return read_table(self.path / name, columns=columns, error=PanelError, remedy=AGAIN)
 
     @property
     def stratum_code(self) -> NDArray[np.int16]:
-        """Return the place of each row's stratum in `strata`, (n,)."""
+        """Return the index of each row's stratum in `strata`, (n,)."""
         return np.asarray(self.meta_column("stratum_code"), np.int16)
 
     @property
     def weights(self) -> F32:
-        """Return each row's importance weight, (n,), with mean 1 over what the quotas draw."""
+        """Return each row's importance weight, (n,), with mean 1 over the draws by quota."""
         return np.asarray(self.meta_column("weight"), np.float32)
 
     def stratum_rows(self) -> list[Ints]:
