@@ -74,11 +74,13 @@ _FAULTS = {
         "NOT coalesce(len(observation) > 0, false) OR reward IS NULL OR episode IS NULL"
         " OR (terminated OR truncated) IS NULL"
     ),
-    "the action of row {row} is no whole number from 0 to 32,767": "NOT discrete",
+    "the action of row {row} is not a whole number from 0 to 32,767": "NOT discrete",
     "the observation of row {row} has {width} entries, that of row 0 {size}": (
         "len(observation) <> size"
     ),
-    "the next observation of row {row} has not {size} entries": "len(next_observation) <> size",
+    "the next observation of row {row} does not have {size} entries": (
+        "len(next_observation) <> size"
+    ),
     "row {row} follows the end of its episode": "after_end",
     "no row ends an episode": "NOT (SELECT max(terminated OR truncated) FROM filled)",
 }
@@ -175,7 +177,9 @@ def open_source(
             if task is None:
                 return ""
             if task.hash != task_hash:
-                raise StoreError(f"its rows are of task {task_hash}, the task given is {task.hash}")
+                raise StoreError(
+                    f"its rows are of task {task_hash}, but the given task is {task.hash}"
+                )
             return msgspec.json.encode(task).decode()
 
         ((content,),) = connection.sql("SELECT sum(hash(given)) FROM given").fetchall()
@@ -191,7 +195,7 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str
     Returns reason -> number of rows left out. Raises ArgumentError or StoreError if columns are
     missing or have other types.
     """
-    remedy = "give rows as Store(…).sql('FROM transitions') has"
+    remedy = "give rows with the columns of Store(…).sql('FROM transitions')"
     try:
         connection.register("given", given)
     except duckdb.InvalidInputException as error:
@@ -240,7 +244,7 @@ def _fill(
         "CREATE VIEW given AS SELECT * EXCLUDE (place, size, after_end, discrete)"
         f" FROM filled WHERE NOT ({unknown})"
     )
-    return {"an episode's last, without a next observation": lost} if lost else {}
+    return {"last of an episode, without a next observation": lost} if lost else {}
 
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
@@ -386,7 +390,7 @@ def _enough_memory() -> Iterator[None]:
         if isinstance(error, OSError) and "Out of Memory" not in str(error):
             raise
         raise PanelError(
-            f"DuckDB may hold too little in memory: {str(error).splitlines()[0]}",
+            f"DuckDB ran out of memory: {str(error).splitlines()[0]}",
             remedy="give it more: RESTOCK_MEMORY_LIMIT, or Store(memory_limit=…)",
         ) from error
 
@@ -410,10 +414,10 @@ def check_free(out: Path, force: bool) -> None:
     own = {HEADER, ROWS, META, EVALUATION_SPLIT}
     if is_panel and (foreign := sorted({item.name for item in out.iterdir()} - own)):
         raise PanelError(
-            f"would be replaced with what is in it beside the panel: {', '.join(foreign[:3])}"
+            f"replacing it would delete other files in it: {', '.join(foreign[:3])}"
             + (" …" if len(foreign) > 3 else ""),
             where=str(out),
-            remedy="move that away, or choose another --out",
+            remedy="move them away, or choose another --out",
         )
 
 
@@ -439,7 +443,7 @@ def _put(partial: Path, out: Path, force: bool) -> None:
                 old.rename(out)
             raise
         raise PanelError(
-            "another builder was faster", where=str(out), remedy="use that panel"
+            "another process built it first", where=str(out), remedy="use that panel"
         ) from error
     finally:
         shutil.rmtree(old, ignore_errors=True)

@@ -62,7 +62,7 @@ def test_next_observations_come_from_the_next_row(tmp_path: Path) -> None:
     given = panel_of(table(after="next_observation"), QUOTAS, tmp_path / "given")
     lost = sum(row["truncated"] and not row["terminated"] for row in ROWS)
     assert lost > 0
-    assert panel.header.left_out == {"an episode's last, without a next observation": lost}
+    assert panel.header.left_out == {"last of an episode, without a next observation": lost}
     kept = np.isin(given.meta["transition_id"].to_numpy(), panel.meta["transition_id"].to_numpy())
     bootstraps = panel.rows[:, panel.columns["discount"]][:, 0] > 0
     np.testing.assert_array_equal(panel.rows[bootstraps], given.rows[kept][bootstraps])
@@ -125,9 +125,9 @@ HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
         (lambda: table(ROWS, "condition"), "it has no condition"),
         (lambda: table(OPEN, "after"), "no row ends an episode"),
         (changed(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
-        (changed(0, next_observation=[1.0]), "next observation of row 0 has not 4 entries"),
+        (changed(0, next_observation=[1.0]), "next observation of row 0 does not have 4 entries"),
         (changed(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
-        (lambda: table(HALVES, "after"), "is no whole number from 0 to 32,767"),
+        (lambda: table(HALVES, "after"), "is not a whole number from 0 to 32,767"),
         (changed(5, action=-1), "the action of row 5 is no whole number"),
         (changed(4, truncated=True), "row 5 follows the end of its episode"),
         (changed(6, condition=None), "1 rows have no coverage label"),

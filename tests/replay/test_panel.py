@@ -233,7 +233,7 @@ def test_another_builder_of_the_same_panel_does_not_collide(transitions, tmp_pat
         write_meta(*args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(pack.Packer, "write_meta", meanwhile)
-    with pytest.raises(PanelError, match="another builder was faster"):
+    with pytest.raises(PanelError, match="another process built it first"):
         build_panel(transitions, uniform(), tmp_path / "p")
     assert [path.name for path in tmp_path.iterdir()] == ["p"]
     Panel.open(tmp_path / "p", verify=True)
