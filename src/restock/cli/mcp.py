@@ -1,6 +1,6 @@
-"""`restock-mcp`: a place's questions as tools of the Model Context Protocol, read-only, on stdio.
+"""`restock-mcp`: read-only tools of the Model Context Protocol about one place, on stdio.
 
-Each answer is what a verb prints as JSON, with a limit on its rows and on its time.
+A tool's answer is what a verb prints as JSON, with limits on its rows and its time.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class McpCommand:
 def _explained(
     tool: Callable[..., dict[str, Any]], error_type: type[Exception]
 ) -> Callable[..., dict[str, Any]]:
-    """Let a tool's errors reach the client as messages: of others it hides the text."""
+    """Wrap a tool so that the client sees the text of its errors, which it would otherwise hide."""
 
     @wraps(tool)
     def run(*args: Any, **named: Any) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class _Questions:
         return dict(self._cut(read_json(file, error=RunError, remedy=remedy)))
 
     def _answer(self, *words: str) -> Any:
-        """Return what a verb prints as JSON, from a process that can be ended."""
+        """Run a verb in a process that can be ended, and return what it prints as JSON."""
         command = [sys.executable, "-m", "restock", *words, "--json"]
         try:
             done = subprocess.run(
@@ -174,7 +174,7 @@ class _Questions:
         return self._cut(json.loads(done.stdout))
 
     def _cut(self, value: Any) -> Any:
-        """Cut long lists, and say so in their last entry."""
+        """Cut long lists; the last entry then gives the full length."""
         if isinstance(value, Mapping):
             return {name: self._cut(one) for name, one in value.items()}
         if not isinstance(value, list):
@@ -184,12 +184,12 @@ class _Questions:
 
     @contextmanager
     def _limited(self, connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-        """Interrupt the connection's queries once the time is over."""
+        """Interrupt the connection's queries after `seconds`."""
         ended, late = Event(), Event()
 
         def stop() -> None:
             wait = self.seconds
-            while not ended.wait(wait):  # again and again: one may come between two queries
+            while not ended.wait(wait):  # repeat: an interrupt between two queries has no effect
                 late.set()
                 connection.interrupt()
                 wait = 0.1

@@ -1,4 +1,4 @@
-"""`restock-node`: an exported policy as a ROS 2 lifecycle node, or played a recording."""
+"""`restock-node`: runs an exported policy as a ROS 2 lifecycle node, or plays it a recording."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class NodeCommand:
         from restock.ingest.live.node import load_ros, run_node
 
         ros = load_ros()
-        PolicyFile(self.policy)  # refused before anything is on the graph
+        PolicyFile(self.policy)  # refuse a bad file before the node joins the graph
         return run_node(ros, self.policy, drive=self.drive, activate=self.activate)
 
     def _play(self, recording: Path) -> int:

@@ -85,7 +85,7 @@ class AuditCommand:
     """Also write JUnit XML: one suite each for audits, difference and gate."""
 
     def run(self) -> int:
-        """Run the audits, print them, and say with the exit code whether one failed."""
+        """Run the audits and print them; return an exit code that tells whether one failed."""
         if (self.capacity or self.reward) and self.second is not None:
             option = "--capacity" if self.capacity else "--reward"
             raise ConfigError("takes one place", where=option, remedy=f"leave out {self.second}")
@@ -133,10 +133,10 @@ class AuditCommand:
         return beside_of(place for place in (self.second, self.third) if place is not None)
 
     def _check_options(self) -> None:
-        """Refuse options that do nothing or cannot be written to, before the work.
+        """Refuse options without effect and outputs that cannot be written, before any audit.
 
         Raises:
-            ConfigError: there is one.
+            ConfigError: there is such an option.
             StoreError: a place beside the store is not a panel or a run.
         """
         if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
@@ -196,7 +196,7 @@ class AuditCommand:
             return refused("comparable", error, option=f"--against {old}")
 
     def _write(self, parts: Sequence[Part], failing: set[str]) -> None:
-        """Write the findings as JUnit XML, if they are wanted."""
+        """Write the findings as JUnit XML, if --junit was given."""
         if self.junit is not None:
             suites = {f"{part.name} {self.store}": part.findings for part in parts}
             write_text(self.junit, junit_suites(suites, failing))
@@ -308,7 +308,7 @@ def _interval(value: float, ends: list[float]) -> str:
 
 
 def _summary(findings: list[Finding]) -> str:
-    """Count findings by status, and say what would have let the skipped audits run."""
+    """Count findings by status, and name what the skipped audits need."""
     past_tense = {"fail": "failed", "warn": "warned", "info": "informed", "pass": "passed"}
     counts = [
         f"{count} {word}"
@@ -387,9 +387,9 @@ def of_gate(document: Mapping[str, Any]) -> list[Finding]:
 
 
 def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
-    """Return a failure for a comparison that was not possible, so that a pipeline does not skip it.
+    """Return a failed finding for a comparison that was not possible, so that a pipeline notices.
 
-    `option` is the option that asked for it, with its value.
+    `option` is the option that requested the comparison, with its value.
     """
     row = {"what": error.what, "where": error.where or ""}
     where = f"{error.where}: " if error.where and error.where not in option else ""
@@ -407,18 +407,19 @@ def _as_finding(
     return Finding(audit, status, len(every), columns, every[:SAMPLE_ROWS], {})
 
 
-DISCOUNT = 0.99  # of a store's rows, unless another is asked for
+DISCOUNT = 0.99  # default discount per step for a store
 REWARD_AUDITS = ("reward_order", "reward_undetermined")
-OF_RUN = "evaluated_"
+OF_RUN = "evaluated_"  # prefix of the audits that read a run's evaluations
 
 
 @dataclass(frozen=True)
 class RewardAudit:
-    """What was found of a store or a run."""
+    """The audit of the reward of a store or a run."""
 
     discount: float
-    returns: list[dict[str, Any]]  # a row a condition, driver and outcome
-    # A row a condition and pair of drivers; ends of `more_return` are NaN below three episodes.
+    returns: list[dict[str, Any]]  # one row per condition, driver and outcome
+    # One row per condition and pair of drivers; with fewer than three episodes, the ends of
+    # `more_return` are NaN.
     order: list[dict[str, Any]]
     findings: list[Finding]
 
@@ -431,21 +432,21 @@ def audit_reward(
     *,
     discount: float | None = None,
 ) -> RewardAudit:
-    """Return whether more success earns more, in a store's logs or a run's evaluations.
+    """Check whether more success earns a higher return, in a store's logs or a run's evaluations.
 
-    A reward that pays for haste gives an agent that touches something in a quarter of its missions
-    more than a driver that touches nothing; an agent trained on it learns to touch. That shows
-    before any training, in the returns of the drivers that are there.
+    A reward that favours haste can give a driver that touches something in a quarter of its
+    missions a higher return than one that touches nothing; an agent trained on it learns to touch.
+    The returns of the drivers in the logs show this before any training.
 
     Args:
         place: a store, or a run.
-        audits, thresholds: all that are known; those of the reward are run.
-        discount: of one step; for a run its own, for a store DISCOUNT.
+        audits, thresholds: all known ones; only those about the reward are run.
+        discount: per step; None: the run's own, or DISCOUNT for a store.
 
     Raises:
-        ConfigError: another discount than a run's evaluations were made with; thresholds that none
-            of the audits uses.
-        RunError: a run that was not evaluated, or by an earlier Restock.
+        ConfigError: the discount is not that of the run's evaluations, or a threshold is for no
+            audit.
+        RunError: the run was not evaluated, or an early version of Restock evaluated it.
         StoreError: there is neither a store nor a run.
     """
     folder = Location.of(place).folder

@@ -46,7 +46,7 @@ class ExportCommand:
     """Print what was written as one JSON document."""
 
     def run(self) -> None:
-        """Write the data set and say what is in it."""
+        """Write the data set, policy or run, and print a summary."""
         if self.to == "onnx":
             refuse(
                 self,
@@ -108,7 +108,7 @@ class ExportCommand:
             output.print_text(f"{made.origin.text if made.origin else ''} -> {self.out}")
 
     def _cameras(self) -> list[str] | None:
-        """Return cameras as `export_dataset` takes them."""
+        """Return the names of cameras, as `export_dataset` takes them; None: all cameras."""
         if self.cameras == "all":
             return None
         names = [name.strip() for name in self.cameras.split(",")]

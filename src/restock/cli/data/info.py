@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
     from restock.ingest.containers.storage import Watch
 
-NAMED = 10  # attachments, metadata records and their entries that are listed
+NAMED = 10  # at most so many attachments, metadata records, or entries of a record are listed
 MAX_VALUE = 60  # characters of an entry's value that are shown
 NANOSECONDS = 1_000_000_000
-# rmw's numbers, which rosbag2 wrote before it wrote names
+# Names of rmw's numbers: early versions of rosbag2 wrote numbers.
 _QOS = {
     "reliability": ("system_default", "reliable", "best_effort"),
     "durability": ("system_default", "transient_local", "volatile"),
     "history": ("system_default", "keep_last", "keep_all"),
 }
-MAX_PROFILES = 20  # of a topic: publishers that offer others
+MAX_PROFILES = 20  # QoS profiles that are read of a topic
 
 
 @dataclass
@@ -83,7 +83,7 @@ class InfoCommand:
         return ExitCode.USAGE if wrong else code
 
     def _findings(self, stores: Sequence[str]) -> list[Finding]:
-        """Look at the stores, or at the machine if no path is given."""
+        """Check the stores, or this machine if no path is given."""
         if self.paths and not stores:
             return []
 
@@ -92,7 +92,7 @@ class InfoCommand:
         return [finding for path in stores for finding in check_store(path)]
 
     def _describe(self, paths: Sequence[str]) -> tuple[ExitCode, list[dict[str, Any]]]:
-        """Describe each recording; return the exit code of the worst, and the descriptions."""
+        """Describe each recording; return the worst exit code, and the descriptions."""
         from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.decoding.definitions import choose_definitions
 
@@ -138,11 +138,11 @@ def describe_recording(
     clocks: bool = False,
     watch: Watch | None = None,
 ) -> dict[str, Any]:
-    """Format, size, time span and topics of one recording; nothing is decoded but for `clocks`.
+    """Return format, size, time span and topics of a recording; only `clocks` decodes messages.
 
-    Times are log times. `rate_hz` is the messages of a topic over the recording's duration. With
-    `clocks` the whole recording is read for its header stamps, every topic has its `clock`, and
-    `integrity` is known; `watch` is told how far that is.
+    Times are log times. `rate_hz` is a topic's number of messages divided by the recording's
+    duration. With `clocks`, the whole recording is read for its header stamps, every topic has a
+    `clock`, and `integrity` is known. `watch` is called with the progress.
 
     Raises:
         RecordingError: it cannot be opened; see `open_recording`.
@@ -198,10 +198,10 @@ def describe_recording(
 
 
 def offered(text: str) -> list[dict[str, Any]]:
-    """Return the quality of service that publishers offered, each profile once.
+    """Return the QoS profiles that publishers offered, without duplicates.
 
-    Reads reliability, durability, history and depth as far as the file has them. It is not parsed
-    as YAML: that is slow, and it may be damaged.
+    Reads reliability, durability, history and depth, if the text has them. The text is not parsed
+    as YAML, because that is slow and the text may be damaged.
     """
     found: list[dict[str, Any]] = []
     for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MAX_PROFILES + 1]:
@@ -243,7 +243,7 @@ def _date(stamp_ns: int) -> str:
 
 
 def _is_store(path: str) -> bool:
-    # By its Delta logs alone: the store's own check would import DuckDB for every recording.
+    # Looks only for Delta logs: the store's own check would import DuckDB for every recording.
     logs = [Path(path, table, "_delta_log") for table in ("transitions", "recordings")]
     return "://" in path or all(log.is_dir() for log in logs)
 
@@ -254,7 +254,7 @@ def _size(count: int) -> str:
 
 
 def _names(names: list[str]) -> str:
-    """List names, each once, and how often it occurs if that is more than once."""
+    """List names without duplicates, with the count of a name that occurs more than once."""
     often = Counter(names)
     listed = [
         f"{name or '(unnamed)'}{f' ({count})' if count > 1 else ''}"
@@ -339,7 +339,7 @@ class Finding(NamedTuple):
 
 
 def check_machine() -> list[Finding]:
-    """Look at what is installed here and what works."""
+    """Check what is installed on this machine, and what works."""
     return [*_machine(), *_packages(), _torch(), _native(), _disk(Path.cwd())]
 
 
@@ -365,7 +365,7 @@ def _packages() -> list[Finding]:
         if requirement.marker and not requirement.marker.evaluate(
             {"extra": extra[1] if extra else ""}
         ):
-            continue  # of other machines
+            continue  # for other machines
         name, wanted = requirement.name, requirement.specifier
         part = f"extra {extra[1]}" if extra else "needed"
         try:
@@ -409,7 +409,7 @@ def _disk(folder: Path) -> Finding:
 
 
 def check_store(path: str) -> list[Finding]:
-    """Look at what a store holds, how long opening it takes, and whether it can be read.
+    """Check what a store holds, how long it takes to open, and whether it can be read.
 
     Raises:
         StoreError: there is no store, or it cannot be read.

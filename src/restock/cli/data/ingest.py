@@ -92,7 +92,7 @@ class IngestCommand:
         if self.workers < 1:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         tags = parse_tags(self.tag, empty=True)
-        profile = load_profile(self.profile)  # before what is slow to import: it may not be there
+        profile = load_profile(self.profile)  # before the slow imports: it may not exist
 
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
@@ -100,7 +100,7 @@ class IngestCommand:
 
         store = None if self.dry_run else self.store
         if store is not None:
-            StoreWriter(store).expect_folder()  # or say now why not, and not once a recording
+            StoreWriter(store).expect_folder()  # fail once and now, not for each recording
             StoreWriter(store).reach()
         chosen = choose_definitions(self.definitions)
         job = IngestJob(*(profile, store, self.force, self.salvage, chosen, self.repeated, tags))
@@ -115,7 +115,7 @@ class IngestCommand:
                 advance(1, path.name)
                 if isinstance(result, RestockError):
                     reported = str(result)
-                    if isinstance(result, StoreError):  # which names the store alone
+                    if isinstance(result, StoreError):  # its message names only the store
                         reported = f"{visible(str(path))}: was not added: {reported}"
                     failures.append({"path": str(path), "status": "failed", "error": reported})
                     said = night.refuse(path, result) if night is not None else reported
@@ -164,13 +164,14 @@ class IngestCommand:
         return list(paths), failures
 
 
-# Of a manifest, as printed: definitions, and what is said in other words.
+# Entries of a manifest that are not printed: definitions, and values that have other keys.
 _LEFT_OUT = (
     *("task_json", "conditions_json", "profile_toml", "source_file", "label_scores"),
     "label_counts",
 )
 
 
+# Attributes of a result that are printed.
 _PRINTED = ("path", "status", "version", "messages", "conditions", "named", "exposures")
 
 
@@ -178,7 +179,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
     """Return an outcome as `--json` prints it."""
     from restock.ingest.store.manifest import GOOD
 
-    # Of events, too; a recording that was ingested before there were such counts has none.
+    # With counts of events, which a recording that an early version ingested does not have.
     counts = {row["condition"]: row for row in outcome.manifest.get("label_counts") or []}
 
     row = {key: value for key, value in outcome.manifest.items() if key not in _LEFT_OUT}
@@ -290,7 +291,7 @@ def show(outcome: IngestResult) -> None:
         for name, count in outcome.conditions.items()
     ]
     output.print_table(labels, output.reported(labels))
-    if outcome.exposures:  # whatever the outcome
+    if outcome.exposures:  # these hold whatever the outcome is
         labels = [
             {"exposure": name, "transitions": count, **against_truth(name)}
             for name, count in outcome.exposures.items()
@@ -319,7 +320,7 @@ def show(outcome: IngestResult) -> None:
 
 
 def _unknown(row: Mapping[str, Any]) -> list[str]:
-    """List the conditions that are unknown for its rows, a line for each reason."""
+    """List the conditions that are unknown for a recording's rows, one line per reason."""
     by_reason: dict[str, list[str]] = {}
     for one in row["unknown_conditions"] or []:
         by_reason.setdefault(one["because"], []).append(one["condition"])

@@ -21,8 +21,8 @@ _UNCERTAIN = {
     "keep": "their labels count as they are",
     "nominal": "it does not count as held",
 }
-TRAINING = 51_500, 128  # updates and rows of each, of `restock train` by default
-_WIDE = 110  # columns of a terminal from which on the table says more
+TRAINING = 51_500, 128  # default updates of `restock train`, and rows per update
+_WIDE = 110  # a terminal with at least this width gets more columns
 
 
 @dataclass
@@ -51,7 +51,7 @@ class MixCommand:
     """Print the plan as one JSON document."""
 
     def run(self) -> None:
-        """Plan, and unless it is a dry run, pack."""
+        """Plan the panel, and write it unless this is a dry run."""
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import check_free, open_source, write_panel
 
@@ -126,7 +126,7 @@ def _line(stratum: Stratum) -> dict[str, Any]:
 
 
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
-    """Print as many columns as fit; shares are in percent, and each says of what."""
+    """Return the rows of the table with as many columns as fit; shares are in percent."""
     rows = []
     missing = any(line["missing_rows"] for line in strata)
     for line in strata:
@@ -157,14 +157,14 @@ def _percent(share: float) -> float:
 
 
 def _missing(line: dict[str, Any]) -> str:
-    """Say how many rows would fill a stratum."""
+    """Say how many more rows would fill a stratum; empty if it is full."""
     if not line["missing_rows"]:
         return ""
     return f"; {counted(line['missing_rows'], 'more row')} would fill it"
 
 
 def _in_training(document: dict[str, Any], most: float) -> list[str]:
-    """Say how much of their quotas logged rows cover at the default training budget."""
+    """Warn of strata whose logged rows cannot fill their quota at the default training budget."""
     updates, batch_size = TRAINING
     short = []
     for line in document["strata"]:

@@ -1,4 +1,4 @@
-"""Many recordings in a few lines: one for each recording, and one total."""
+"""Summaries of many recordings: a line for each recording, and a total."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATUSES = ("written", "tagged", "dry run", "unchanged", "refused")
 
 
 class Night:
-    """The recordings of one `restock ingest`: what to print of each, and their total."""
+    """The recordings of one `restock ingest`: counts them, and formats their lines and total."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         folders = [str(path.parent.absolute()) for path in paths]
@@ -28,12 +28,12 @@ class Night:
         self.statuses = Counter[str]()
         self.labels = Counter[str]()
         self.reasons = Counter[str]()
-        self.found = Counter[str]()  # what is wrong, and in how many recordings
+        self.found = Counter[str]()  # problem -> recordings that have it
         self.transitions = self.skipped = self.dropped = 0
         self.duration_s = 0.0
 
     def name(self, path: Path | str) -> str:
-        """Return a recording's path below the folder that all are in."""
+        """Return a recording's path, relative to the folder that contains all recordings."""
         return visible(os.path.relpath(path, self.folder)) if self.folder else visible(str(path))
 
     def add(self, outcome: IngestResult) -> str:
@@ -92,7 +92,7 @@ class Night:
 
 
 def labels_of(conditions: Mapping[str, int]) -> dict[str, int]:
-    """Return the labels that hold anywhere, without `nominal`, by their rows."""
+    """Return label -> rows for the labels that hold in any row, without `nominal`."""
     return {name: rows for name, rows in conditions.items() if rows and name != "nominal"}
 
 

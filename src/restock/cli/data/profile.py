@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
     from restock.ingest.propose.drives import Drives, RobotTraits
 
-# of a proposal
+# Attributes of a proposal that are printed.
 _PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands", "kinds")
 OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
@@ -83,7 +83,7 @@ class ProfileCommand:
     "inside_outline", "outcome", …}."""
 
     def run(self) -> int:
-        """Do one of the two."""
+        """Propose or check a profile."""
         wrong = not self.paths if self.action == "new" else len(self.paths) != 2
         if wrong:
             wanted = "at least 1 path" if self.action == "new" else "2 paths"
@@ -109,7 +109,7 @@ class ProfileCommand:
             self.hindsight_goals,
         )
         stem = (self.out or Path(self.paths[0])).stem
-        if self.out is None and self.robot is not None:  # of one name, they would be two versions
+        if self.out is None and self.robot is not None:  # else robots' profiles would share a name
             stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)
@@ -122,7 +122,7 @@ class ProfileCommand:
                 name = re.sub(r"\W+", "_", stem).strip("_") or "robot"
                 proposal = propose_for_drives(recordings, drives, name, given)
             losses = _losses(recordings, proposal.toml)
-        chosen.sort(key=lambda path: path != proposal.base)  # that one first
+        chosen.sort(key=lambda path: path != proposal.base)  # the base comes first
         toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
         if self.out is not None:
             write_text(self.out, toml)
@@ -159,10 +159,10 @@ class ProfileCommand:
         return ExitCode.LOSSY if lossy else ExitCode.OK
 
     def _drives(self, paths: Sequence[Path]) -> tuple[Drives, list[Path]]:
-        """Group recordings by kind of robot, and name those that cannot be read.
+        """Group recordings by kind of robot, and list the recordings that cannot be read.
 
         Raises:
-            RecordingError: none can be read.
+            RecordingError: no recording can be read.
         """
         from restock.ingest.propose.drives import Drives, drives_by_kind, robot_traits
 
@@ -195,7 +195,7 @@ class ProfileCommand:
             recording = open_recording(
                 path, definitions=self.definitions, salvage=self.salvage, watch=advance.part
             )
-        recording.watch = unwatched  # the bar is over
+        recording.watch = unwatched  # the progress bar has ended
         if self.robot is not None:
             try:
                 choose_robot(recording, self.robot)
@@ -254,7 +254,7 @@ class ProfileCommand:
     def _advice(
         self, profile: Profile, outcome: IngestResult | None
     ) -> tuple[list[str], float | None]:
-        """Say what in the profile removes or labels most rows, and what to try.
+        """Return advice: what in the profile removes or labels most rows, and what to try.
 
         Also return the share of ticks at which the lidar sees something inside the robot's outline.
         """
@@ -281,9 +281,9 @@ class ProfileCommand:
 
 
 def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
-    """List what is missing of the recordings' files and of the topics that a profile takes.
+    """List the data that is lost in the recordings' files and in the topics that a profile uses.
 
-    If the profile cannot be used yet, all topics that were read count.
+    If the profile cannot be used yet, losses in all topics that were read are listed.
     """
     from restock.ingest.profile.profile import parse_profile
 

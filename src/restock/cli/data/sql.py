@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import duckdb
 
 SHOWN_ROWS = 40  # on a terminal; a file or a pipe gets all
-CUT_TO = 4  # values of a list in a record that are shown if it has more than twice as many
+CUT_TO = 4  # values shown of a list that has more than twice as many, in a record on a terminal
 RECORDS = r"\G"  # ends a query instead of a semicolon, as in MySQL
 HELP = r"""End a query with ";", or with "\G" to see each row as a record.
   .tables          the tables and views
@@ -128,7 +128,7 @@ class SqlCommand:
             )
 
     def _write(self, connection: duckdb.DuckDBPyConnection, text: str, out: Path) -> None:
-        """Write the rows of a query to a file, by its ending."""
+        """Write the rows of a query to a file, in the format that its ending names."""
         from restock.files import expect_file_place, temporary_name
         from restock.replay.store.query import fetch, write_parquet
 
@@ -180,7 +180,7 @@ class SqlCommand:
                     self._answer(connection, question)
             except EOFError:
                 return
-            except KeyboardInterrupt:  # of this query, not of the prompt
+            except KeyboardInterrupt:  # ends this query, not the prompt
                 went_on_after_interrupt()
                 text = ""
                 output.say("stopped")
@@ -188,7 +188,10 @@ class SqlCommand:
                 sys.stderr.write(f"{error}\n")
 
     def _places(self) -> tuple[str, tuple[str, ...], str | None]:
-        """Return the place to query, those beside it, and the query: a last word that is none."""
+        """Return the place to query, the places beside it, and the query.
+
+        The last word is the query if it is not a place.
+        """
         from restock.replay.places import kind_beside
 
         others = [word for word in (self.second, self.third, self.query) if word is not None]

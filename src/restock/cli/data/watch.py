@@ -1,10 +1,10 @@
-"""`restock ingest FOLDER --watch`: take recordings as they arrive, one line of log an event.
+"""`restock ingest FOLDER --watch`: ingest recordings as they arrive, with a line of log per event.
 
-A recording is complete if its files have kept their names, sizes and times for `STILL_S`, and if it
-says so itself: an MCAP file ends with its footer, a bag's folder has the metadata.yaml that rosbag2
-writes last, and every file that it lists, and a LeRobot folder has the frames that its info counts.
-Nothing is remembered on disk: the store knows recordings by their content, so a process that was
-killed takes them all again, and those that are in the store are unchanged.
+A recording is complete if its files have kept their names, sizes and times for `STILL_S`, and if
+its format has its end: an MCAP file has its footer; a bag's folder has the metadata.yaml that
+rosbag2 writes last, and every file listed there; a LeRobot folder has as many frames as its info
+counts. No state is kept on disk. A process that is started again ingests all recordings again; the
+store recognises those that it holds by their content, and they are reported as unchanged.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from restock.replay.store.store import is_store
 
 POLL_S = 2.0
 STILL_S = 10.0
-RETRY_S = 60.0  # after a failure that is not the recording's: a full disk, a store out of reach
-SALVAGE_AFTER_S = 600.0  # with --salvage: what does not become complete is taken as it is
+RETRY_S = 60.0  # after a failure that the recording did not cause: full disk, unreachable store
+SALVAGE_AFTER_S = 600.0  # with --salvage, a recording that stays incomplete is then ingested
 
 Stamp = tuple[tuple[str, int, int], ...]  # name, bytes and time of each file
 
 
 @dataclass
 class Watch:
-    """Watch folders until it is interrupted.
+    """Watches folders until it is interrupted.
 
-    After recordings were written: coverage, audits, and the command `hook`. It gets what is new as
-    JSON on its standard input. All three also come once at the start, because an earlier process
-    may have been killed before them.
+    After it has written recordings, it prints coverage and audits and runs the command `hook`,
+    which gets a JSON document about the new recordings on standard input. It does all three at the
+    start too, because an earlier process may have been killed before it did.
     """
 
     folders: tuple[str, ...]
@@ -64,21 +64,21 @@ class Watch:
     hook: str | None
     workers: int
     json: bool
-    rows: dict[str, int] = field(default_factory=dict)  # of each condition, as last said
+    rows: dict[str, int] = field(default_factory=dict)  # rows of each condition, as last printed
 
     def __post_init__(self) -> None:
         for folder in self.folders:
             if not Path(folder).is_dir():
                 raise ConfigError("not a folder, so nothing can arrive in it", where=folder)
-        if self.job.repeated == "keep":  # a part that was taken too early leaves for the whole
+        if self.job.repeated == "keep":  # if a part was ingested too early, the whole replaces it
             self.job = replace(self.job, repeated="replace")
         self.arrivals = Arrivals(self.folders, self.job.salvage)
         self.night = Night([Path(folder) / "recording" for folder in self.folders])
 
     def run(self) -> NoReturn:
-        """Look, take, and sleep."""
+        """Ingest complete recordings and follow up, again and again."""
         self.say("watch", ", ".join(self.folders))
-        written: list[dict[str, Any]] = []  # that no follow-up has had yet
+        written: list[dict[str, Any]] = []  # not yet followed up
         due_s = time.monotonic() if is_store(str(self.job.store)) else math.inf
         while True:
             _raise_interrupt()
@@ -91,7 +91,7 @@ class Watch:
             time.sleep(POLL_S)
 
     def take(self) -> list[dict[str, Any]]:
-        """Ingest what is complete; return what was written."""
+        """Ingest the complete recordings; return a row about each that was written."""
         ready = self.arrivals.complete(time.monotonic())
         for event, there, why in self.arrivals.news:
             self.say(event, f"{self.night.name(there)}: {why}" if why else there)
@@ -115,7 +115,7 @@ class Watch:
         return written
 
     def _ingested(self, ready: Sequence[Path]) -> Iterator[Result]:
-        """Ingest; what fails for all of them (the store, the disk) fails for each."""
+        """Ingest recordings; if the store or disk fails, yield an error for each remaining one."""
         left = list(ready)
         try:
             for path, result in ingest_all(ready, self.job, workers=self.workers):
@@ -159,7 +159,7 @@ class Watch:
         self.say("hook", f"exit {done.returncode}")
 
     def say(self, event: str, what: str) -> None:
-        """Print one line, whatever is in it."""
+        """Print one line of log."""
         _raise_interrupt()
         at = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         if self.json:
@@ -171,7 +171,7 @@ class Watch:
 
 
 def _raise_interrupt() -> None:
-    """Raise the interrupt of which a library made an error of its own, or which it lost."""
+    """Raise KeyboardInterrupt if a library turned an interrupt into another error, or lost it."""
     if was_interrupted():
         raise KeyboardInterrupt
 
@@ -181,13 +181,13 @@ class _Arrival:
     stamp: Stamp
     since_s: float
     done: bool = False
-    said: str = ""  # why it waits, or failed
+    said: str = ""  # the last reason reported for waiting or failing
     not_before_s: float = 0.0
 
 
 @dataclass
 class Arrivals:
-    """The recordings below some folders. `news`, (event, path, why), is what the last look saw."""
+    """The recordings below some folders. `news` has the last look's events: (event, path, why)."""
 
     folders: Sequence[str]
     salvage: bool = False
@@ -196,10 +196,10 @@ class Arrivals:
     _absent: set[str] = field(default_factory=set)
 
     def complete(self, now_s: float) -> list[Path]:
-        """Look at the folders; return the recordings that can be taken now."""
+        """Look at the folders; return the complete recordings that are not ingested yet."""
         self.news = []
         there = {path: stamp for path in self._found() if (stamp := stamp_of(path))}
-        if not self._absent:  # a disk that is away forgets nothing
+        if not self._absent:  # a folder may come back with the recordings it had
             self._known = {path: one for path, one in self._known.items() if path in there}
         ready = []
         for path, stamp in there.items():
@@ -215,7 +215,7 @@ class Arrivals:
         return ready
 
     def take(self, path: Path, error: RestockError | None, now_s: float) -> bool:
-        """Note how an ingest ended; return whether that is new.
+        """Record how an ingest ended; return whether this has not been reported before.
 
         A recording that was refused is tried again if its files change; any other failure is tried
         again later.
@@ -242,7 +242,7 @@ class Arrivals:
                 self.news.append(("back", folder, ""))
             try:
                 yield from recordings_in(folder)
-            except RecordingError:  # none yet; or it went away just now, as the next look will say
+            except RecordingError:  # none yet, or the folder has just gone: the next look reports it
                 continue
 
     def _wait(self, path: Path, why: str) -> None:
@@ -253,9 +253,9 @@ class Arrivals:
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return what changes while a recording is written; empty if it is gone."""
+    """Return name, size and time of each file of a recording; empty if it is gone."""
     try:
-        beside = path.with_name(f"{path.name}-wal")  # where sqlite keeps what it wrote last
+        beside = path.with_name(f"{path.name}-wal")  # SQLite's write-ahead log
         files = sorted(path.rglob("*")) if path.is_dir() else [path, beside]
         found = [(file, file.stat()) for file in files if file.is_file()]
         return tuple((str(file), about.st_size, about.st_mtime_ns) for file, about in found)
@@ -264,7 +264,7 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def incomplete(path: Path) -> str:
-    """Return why a recording whose files are still is not complete; "" if it is."""
+    """Return why a recording whose files no longer change is incomplete; "" if it is complete."""
     try:
         if not path.is_dir():
             return _unfinished(path)
@@ -293,7 +293,7 @@ def _unfinished(file: Path) -> str:
 
 
 def transient(error: RestockError) -> bool:
-    """Return whether a failure may be over later although the recording stays as it is."""
+    """Return whether a later attempt may succeed although the recording has not changed."""
     return isinstance(error, StoreError) or error.what.startswith(
         ("cannot be read", "out of memory", "the process that read it")
     )

@@ -1,1 +1,1 @@
-"""The whole way in one command: a stranger's recordings (`start`) or the sample logs (`demo`)."""
+"""All stages in one command: on a user's recordings (`start`) or the sample logs (`demo`)."""

@@ -1,4 +1,4 @@
-"""Decisions of `restock start` between its stages, from what these printed."""
+"""Decisions that `restock start` makes between stages, from what the stages printed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from restock.files import read_json
 if TYPE_CHECKING:
     from restock.ingest.task.task import Task
 
-STEPS_A_SECOND = 500  # in the twin on a free core, for which draws are planned
-WARM_UP_PART = 0.5  # share of the draws that few rows allow
+STEPS_A_SECOND = 500  # in the twin on a free core; for planning draws
+WARM_UP_PART = 0.5  # share of the allowed draws for offline updates, if rows are few
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other stages
-INTERVALS = 20  # at least so many points of every curve
+INTERVALS = 20  # least number of points in every curve
 DRIVERS = "behaviour_policies"  # key in a row of the coverage
-INSIDE = 0.5  # share of ticks: with more returns inside the outline, the outline is wrong
+INSIDE = 0.5  # share of ticks with returns inside the outline above which the outline is wrong
 
 
 class Stop(Exception):
-    """A point where a person must decide: why, and what to type or to edit."""
+    """Raised where a person must decide: tells why, and what to type or to edit."""
 
     def __init__(self, why: str, *remedies: str) -> None:
         super().__init__(why)
@@ -42,7 +42,7 @@ def edited(profile: Path | str | None, out: Path) -> bool:
 
 
 def several_kinds(kinds: list[Any], out: Path) -> Stop:
-    """Stop at recordings of several kinds of robots, with one call for each kind as remedy."""
+    """Return a stop for recordings of several kinds of robots; its remedies are a call per kind."""
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
     reported = [
         f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds
@@ -62,7 +62,7 @@ def several_kinds(kinds: list[Any], out: Path) -> Stop:
 def proposal(out: Path) -> tuple[list[str], str | None]:
     """Return the recordings that a folder's proposal leaves out, and the one it was made from.
 
-    Left out are those of other kinds of robots, and those that could not be read.
+    It leaves out recordings of other kinds of robots, and recordings that could not be read.
     """
     proposed = out / FOLDER / "propose.json"
     found = read_json(proposed) if proposed.is_file() else {}
@@ -71,7 +71,7 @@ def proposal(out: Path) -> tuple[list[str], str | None]:
 
 
 def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
-    """Stop if the lidar sees something inside the robot's outline most of the time."""
+    """Return a stop if the lidar sees something inside the robot's outline most of the time."""
     inside, task = checked.get("inside_outline"), _task(profile)
     if task is None or inside is None or inside <= INSIDE:
         return None
@@ -87,7 +87,7 @@ def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
 
 
 def horizon(profile: Path | str | None) -> float:
-    """Return some 3 s in whole control periods, the horizon of the twin's limits."""
+    """Return about 3 s as whole control periods: the horizon of the twin's limits."""
     if (task := _task(profile)) is None:
         return 3.0
     period_s = task.control_period_s
@@ -113,7 +113,7 @@ NO_ROOM = "no mission fits on the floor that the recordings show"
 
 
 def mistrust(floor: Ended, gap: Ended) -> str | None:
-    """Say why the twin is not to be trusted in nominal driving; None if it is."""
+    """Explain why the twin cannot be trusted in nominal driving; None if it can."""
     if not floor.good:
         return f"there is no floor to drive on: {'; '.join(floor.errors)}"
     if "nominal" not in floor.document["episodes"]:
@@ -129,7 +129,7 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
-    """Train on the floor, on these kinds of episode; none: all."""
+    """Return settings to train on the floor, on these kinds of episode; on all if empty."""
     from restock.toml import toml_value
     from restock.train.twin.missions import DEFAULT_CONDITIONS
 
@@ -141,9 +141,9 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
 
 
 def possible_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
-    """Return the kinds of mission that the floor has room for: to drive, and to leave out.
+    """Split the kinds of mission that the floor has room for: kinds to drive, kinds to leave out.
 
-    A robot without a lidar finds what some missions stage only by driving into it.
+    Without a lidar, some kinds are left out: the robot would find a block only by driving into it.
     """
     from restock.train.twin.missions import MISSIONS
 
@@ -167,9 +167,9 @@ def updates_settings(
 ) -> list[str]:
     """Return settings for as many offline updates as the panel's rows and the budget allow.
 
-    Each row may be drawn only so often. If there are few rows, half of the draws are left for the
-    `seconds` in the twin, and planned for the steps that fit into them. Each curve gets enough
-    points.
+    `max_replays_per_row` limits the draws of a row. If rows are few, half of the draws are kept for
+    the twin, and `env_steps` is planned as the steps that fit into `seconds`. Without a twin, rows
+    are recorded often enough for `INTERVALS` points in each curve.
     """
     from restock.train.dqn.config import TrainConfig
 

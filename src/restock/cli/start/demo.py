@@ -1,6 +1,6 @@
-"""`restock demo`: the whole way in one command, on recordings that come with Restock.
+"""`restock demo`: all stages in one command, on recordings that come with Restock.
 
-Each stage says why it is there, and shows the command that does it: one that a user could type.
+Each stage prints its purpose, and its command as a user could type it.
 """
 
 from __future__ import annotations
@@ -98,12 +98,12 @@ def find_logs() -> Path | None:
 
 
 def logs_alone(to: Settings) -> Path:
-    """Return the run that never drives, to compare fine-tuning with."""
+    """Return the folder of the run that never drives, to compare fine-tuning with."""
     return to.out / "logs-alone"
 
 
 def fed_uniformly(to: Settings) -> Path:
-    """Return the run that is fed the logs as they are."""
+    """Return the folder of the run that draws its rows uniformly."""
     return to.out / "fed-uniformly"
 
 
@@ -134,7 +134,7 @@ def plan_of(to: Settings) -> list[Stage]:
             title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
             beside=tuple(to.training(uniform_panel, uniform)),
             writes=(to.run, uniform),
-            resume=(),  # one of the two may have ended
+            resume=(),  # one of the two trainings may have ended
         ),
         Stage(
             "even-out",
@@ -153,7 +153,7 @@ def plan_of(to: Settings) -> list[Stage]:
     ]
 
 
-# stage -> why it is there
+# stage -> its purpose, printed above its command
 WHY = {
     "record": "This installation has no sample recordings: a simulated robot records some.",
     "info": "The recordings come first: topics, types, counts, durations.",
@@ -184,12 +184,15 @@ WHY = {
 
 
 def catch_up(to: Settings) -> list[str] | None:
-    """Continue the run that drove less: a comparison of feeds needs equally many steps."""
+    """Return the command that continues the run with fewer steps; None if both have as many.
+
+    A comparison of feeds needs equally many steps.
+    """
     steps = {path: steps_of(path) for path in (to.run, fed_uniformly(to))}
     behind, ahead = sorted(steps, key=lambda path: steps[path])
     if steps[behind] == steps[ahead]:
         return None
-    longest_s = f"{10 * to.seconds + 600:g}"  # the steps end it
+    longest_s = f"{10 * to.seconds + 600:g}"  # so long that the steps end it
     budget = ("--env-steps", str(steps[ahead]), "--seconds", longest_s)
     return ["train", "--resume", str(behind), *budget]
 
@@ -246,7 +249,7 @@ SAMPLE_OF_ONE = (
     " same probability.",
     "One seed each is a sample of one: docs/evidence.md has ten, and what 128,000 steps gave.",
 )
-UPDATES = 2000  # of the policy from the logs alone, as many as before driving in the twin
+UPDATES = 2000  # of the policy from the logs alone: as many as other runs make before they drive
 
 
 def before_and_after(evaluated: Document) -> list[dict[str, str]]:
@@ -268,7 +271,7 @@ def before_and_after(evaluated: Document) -> list[dict[str, str]]:
 def rare_event(to: Settings) -> list[str]:
     """Follow a logged row of a rare condition to its update and its recording, if there is one.
 
-    It is the one of the rarest condition with the largest TD error, of those audited.
+    Of the audited rows of the rarest condition, it takes the row with the largest TD error.
     """
     from restock.replay.trace.trace import trace_row
     from restock.train.run.run import Run

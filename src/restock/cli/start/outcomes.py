@@ -1,4 +1,4 @@
-"""Results of stages in a line or two, from the documents that their verbs print."""
+"""Summaries of stages in a few lines, from the documents that their verbs print."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def info(document: Document) -> list[str]:
 
 
 def propose(document: Document) -> list[str]:
-    """Say what the proposed profile makes of the recording."""
+    """Say how many transitions the proposed profile gives, and what it could not use."""
     made, ticks = counted(document["transitions"], "transition"), counted(document["ticks"], "tick")
     lines = [f"{made} of {ticks}"]
     if unread := document.get("unread"):
@@ -44,7 +44,7 @@ def propose(document: Document) -> list[str]:
 
 
 def check(document: Document) -> list[str]:
-    """Say what the profile finds, and what stands in for missing inputs."""
+    """Say how many transitions the profile gives, and what stands in for missing inputs."""
     if (outcome := document["outcome"]) is None:
         return list(document["problems"])
     made = counted(outcome["transitions"], "transition")
@@ -58,7 +58,7 @@ def check(document: Document) -> list[str]:
     return lines + ([f"not in the recording: {'; '.join(missing)}"] if missing else [])
 
 
-_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # named if missing
+_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # inputs to name if missing
 
 
 def ingest(document: Document) -> list[str]:
@@ -92,13 +92,13 @@ def ingest(document: Document) -> list[str]:
 
 
 def _some(lines: list[str], most: int = 3) -> list[str]:
-    """Return the first lines, and how many more there are."""
+    """Return the first `most` lines, and a line with the number of further ones."""
     more = [f"… and {len(lines) - most} more"] if len(lines) > most else []
     return lines[:most] + more
 
 
 def coverage(document: Document) -> list[str]:
-    """Count the rows that hold each condition; unknown: a signal or a plan is missing."""
+    """Count the rows of each condition; the count is unknown if a signal or a plan is missing."""
     counts = {row["condition"]: row["rows_held"] for row in document["rows"]}
     shown = [f"{name} {'unknown' if n is None else f'{n:,}'}" for name, n in counts.items()]
     return [f"rows that hold each condition: {', '.join(shown)}"]
@@ -114,7 +114,7 @@ def audit(document: Document) -> list[str]:
 
 
 def mix(document: Document) -> list[str]:
-    """Count the rows, and say what is short."""
+    """Count the panel's rows, and name the strata that are short of rows."""
     short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
     lines = [f"panel {document['id']}: {counted(document['rows'], 'row')} to learn from"]
     if held := document["evaluation_split"]["rows"]:
@@ -193,7 +193,7 @@ def driven(document: Document) -> list[str]:
 
 
 def on_logs(document: Document) -> list[str]:
-    """Compare the policy's worth by held-out logs with what the logs' drivers achieved."""
+    """Compare the policy's value, estimated on held-out logs, with what the drivers achieved."""
     shown: dict[str, list[str]] = {}
     for row in document["results"]:
         if row["condition"] == "all":
@@ -212,7 +212,7 @@ def _estimate(row: Mapping[str, Any]) -> str:
 
 
 def errors(text: str) -> list[str]:
-    """Return the complaints that a verb left on stderr, with remedies and without progress."""
+    """Return the errors that a verb printed on stderr, with remedies and without progress."""
     found: list[str] = []
     for line in text.splitlines():
         if line.startswith(_COMPLAINT):

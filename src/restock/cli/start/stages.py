@@ -18,7 +18,7 @@ COVERAGE = (
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of the way from recordings to a report, and when to run it again."""
+    """A step between recordings and report: its command, and when to run it again."""
 
     name: str
     title: str
@@ -26,15 +26,15 @@ class Stage:
     reads: tuple[Path, ...] = ()  # the user's files: the stage is run again if one changes
     writes: tuple[Path, ...] = ()
     expected: tuple[int, ...] = (0,)  # exit codes after which the next stage runs
-    outcome: Callable[[Document], list[str]] = lambda document: []  # in a line or two
-    shows_progress: bool = False  # it takes minutes
+    outcome: Callable[[Document], list[str]] = lambda document: []  # summary in a few lines
+    shows_progress: bool = False  # for a stage that takes minutes
     resume: tuple[str, ...] = ()  # the command that continues an interrupted stage
     beside: tuple[str, ...] = ()  # a command that runs at the same time
     # The command if it depends on earlier stages; None: there is nothing to do.
     decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
-        """Return the command as it is typed, below the one that runs beside it."""
+        """Return the command as a user types it, below the command that runs beside it."""
         beside = f"restock {shlex.join(self.beside)} &\n" if self.beside else ""
         return f"{beside}restock {shlex.join(self.command)}"
 
@@ -45,10 +45,10 @@ class Settings:
 
     logs: tuple[str, ...]
     out: Path
-    profile: Path | str | None = None  # None: that of the shipped robot
+    profile: Path | str | None = None  # None: the default of `restock ingest`
     seconds: float = 150.0  # of training time
     episodes: int = 20  # evaluated per kind, policy and perturbation
-    kinds: tuple[str, ...] = ()  # kinds of missions; none: all that the floor has room for
+    kinds: tuple[str, ...] = ()  # kinds of missions; empty: all that the floor has room for
     mixture: str = "coverage"
     definitions: str | None = None  # as `open_recording` takes them
     salvage: bool = False
@@ -94,7 +94,7 @@ class Settings:
 
     @property
     def files_read(self) -> tuple[Path, ...]:
-        """Return the user's files that every stage reads which reads a recording."""
+        """Return the user's files that are read by every stage that reads recordings."""
         from restock.ingest.decoding.definitions import choose_definitions
 
         place = choose_definitions(self.definitions).partition("+")[2]
@@ -109,7 +109,7 @@ class Settings:
 
 
 def own_file(name: Path | str | None) -> tuple[Path, ...]:
-    """Return the file of this name, unless it is the name of a shipped one."""
+    """Return the file with this name; empty if there is none, as for a shipped name."""
     return () if name is None or not Path(name).is_file() else (Path(name),)
 
 
@@ -145,7 +145,7 @@ def check(to: Settings, recording: str) -> Stage:
         "Does the profile fit?",
         ["profile", "check", str(to.profile), recording, *to.read_options],
         reads=own_file(to.profile),
-        expected=(0, 3),  # 3: data was lost, which ingest says of all recordings
+        expected=(0, 3),  # 3: data was lost; ingest reports it for all recordings
         outcome=outcomes.check,
     )
 
@@ -186,7 +186,7 @@ def mix(to: Settings) -> Stage:
 
 
 def floor(to: Settings) -> Stage:
-    """Make the twin's floor from the user's map, else from scans, else from the path driven."""
+    """Make the twin's floor from the user's map, else from scans, or else from the path driven."""
     given = () if to.map is None else ("--map", str(to.map))
     picture = to.floor.with_suffix(".png")
     words = ("twin", "layout", "--from", str(to.store), *given, *to.definition_options)
@@ -201,7 +201,7 @@ def floor(to: Settings) -> Stage:
 
 
 def fit(to: Settings, horizon_s: float) -> Stage:
-    """Fit the twin's robot to what the robot did; by few segments, as minutes matter."""
+    """Fit the twin's robot to the logs, with few segments to save time."""
     few = ("--segments", "80", "--horizon-s", f"{horizon_s:g}")
     return Stage(
         "fit",
@@ -241,7 +241,7 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
 
 
 def evaluate(to: Settings, *policies: str) -> Stage:
-    """Evaluate in the twin, beside the planner and a random policy; and these, if any is named."""
+    """Evaluate in the twin, beside the planner, a random policy and any given `policies`."""
     named = ("--policies", ",".join(("agent", *policies, "planner", "random"))) if policies else ()
     return Stage(
         "eval",

@@ -1,4 +1,4 @@
-"""`restock start`: from a stranger's bag to a policy and a report, stage by stage."""
+"""`restock start`: from a user's recordings to a policy and a report, stage by stage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from restock.cli.start.work import Ended, Work, escape, speaker
 from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, ExitCode, RecordingError, quoted
 
-HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
+HELD_OUT = "evaluation split"  # a panel's reason to leave out rows: the policy is evaluated on them
 AGAIN = "then run the same command again: finished stages are kept"
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
@@ -25,8 +25,8 @@ SALVAGING = "add --salvage to this command: it reads what is intact in damaged r
 class Way:
     """The stages from recordings to a report, run one after the other.
 
-    `to` is what the stages share; it changes as stages end. `first` is one of the recordings, which
-    a plan names without reading it.
+    `to` has the settings that the stages share; it is replaced as stages end. `first` is one of the
+    recordings; a dry run names it without reading any.
     """
 
     def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:
@@ -75,7 +75,7 @@ class Way:
         return readable
 
     def _longest(self, recordings: list[Document]) -> str:
-        """Return the longest of these recordings, else the first of all."""
+        """Return the longest of these recordings; `first` if there are none."""
         times = {row["path"]: row["duration_s"] or 0.0 for row in recordings}
         return str(max(times, key=times.__getitem__, default=self.first))
 
@@ -144,7 +144,7 @@ class Way:
         return covered.document, mixed.document
 
     def _twin(self) -> Ended | None:
-        """Make the floor, and decide whether to train in the twin; None: on the logs alone."""
+        """Make the floor and fit the twin; return the floor, or None to train on logs alone."""
         requested, to = self.requested, self.to
         if requested.twin == "no":
             return None
@@ -195,7 +195,7 @@ class Way:
             raise Stop("training did not finish", *trained.errors[:2], AGAIN)
 
     def _judge(self, floor: Ended | None, panel: Document) -> None:
-        """Evaluate in the twin and on held-out logs, and write one page."""
+        """Evaluate in the twin and on held-out logs, and write the report."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
             judged.append(do(stages.evaluate(to, "cloned")))
@@ -299,10 +299,10 @@ class StartCommand:
         return int(ExitCode.LOSSY)
 
     def _expect_a_recording(self) -> str:
-        """Return the first path, or file in a folder, whose first bytes are a recording's.
+        """Return the first path, or file in a folder, that begins like a recording.
 
         Raises:
-            RecordingError: a path is none, or no file is a recording.
+            RecordingError: nothing at a path looks like a recording, or no file is one.
         """
         from restock.ingest.containers.open_recording import recordings_in, refuse_no_recording
 
@@ -316,10 +316,10 @@ class StartCommand:
         raise wrong[0]
 
     def _check(self) -> None:
-        """Read what is given beside the recordings, before anything is written.
+        """Check the options and files beside the recordings, before anything is written.
 
         Raises:
-            ConfigError, RecordingError: it cannot be read.
+            ConfigError, RecordingError: one of them is wrong or cannot be read.
         """
         from restock.ingest.decoding.definitions import choose_definitions
         from restock.ingest.profile.profile import load_profile

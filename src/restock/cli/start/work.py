@@ -1,7 +1,7 @@
-"""Running stages, each once: a finished stage with unchanged inputs is skipped.
+"""Runs stages, and skips a finished stage whose inputs have not changed.
 
-`OUT/start/NAME.json` is what the stage's verb printed; `OUT/start/stages.json` says of each stage
-which command it ran, from which inputs, and how it ended.
+`OUT/start/NAME.json` is the document that the verb of stage NAME printed. `OUT/start/stages.json`
+has the command of each stage, a hash of its inputs, and its result.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 FOLDER, RECORD = "start", "stages.json"
-LAST_LINES = 20  # shown of a command that runs beside another and fails
+LAST_LINES = 20  # shown if a command that runs beside another fails
 Dispatch = Callable[[list[str]], int]
 
 
 @dataclass
 class Ended:
-    """The result of a stage, of this call or of an earlier one."""
+    """The result of a stage, from this call or an earlier one."""
 
     name: str
     command: str
@@ -61,10 +61,10 @@ class Ended:
 
 
 class Work:
-    """Runs stages in a folder of its own, and remembers them.
+    """Runs stages, and records their results in the folder `out`.
 
-    `say` prints a line. With `plan` nothing is run: the commands are said. `why` says of a stage by
-    its name why it is there.
+    `say` prints a line. With `plan`, commands are printed and not run. `why` has the purpose of
+    stages by name, to print above their commands.
     """
 
     def __init__(
@@ -96,10 +96,10 @@ class Work:
             self._keep()
 
     def do(self, stage: Stage) -> Ended:
-        """Run a stage, or take its earlier result; say what it does and what came of it.
+        """Run a stage, or reuse its earlier result; print its command and result.
 
         Raises:
-            KeyboardInterrupt: it was interrupted; the same stage then goes on, or begins again.
+            KeyboardInterrupt: it was interrupted; the next call continues or repeats the stage.
         """
         self.say(f"\n[bold]{len(self.ended) + 1}  {stage.title}[/bold]")
         if (why := self.why.get(stage.name)) is not None:
@@ -122,7 +122,7 @@ class Work:
         else:
             self._clear(stage)
         self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
-        # Begun, not ended: if this process dies now, the stage is run again.
+        # Recorded as begun: if this process dies now, the next call runs the stage again.
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
         self._keep()
         return self._note(self._run(stage, stamp), reported=stage.shows_progress)
@@ -162,7 +162,7 @@ class Work:
         return ended
 
     def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
-        """Report the result of a stage, and its complaints unless they were `reported` before."""
+        """Print the result of a stage, and its errors unless they were `reported` before."""
         self.ended.append(ended)
         for line in ended.outcome:
             self.say(f"   {escape(line)}")
@@ -174,11 +174,11 @@ class Work:
         return ended
 
     def _before(self, stage: Stage, stamp: str) -> Ended | None:
-        """Return what an earlier call made of the same inputs, if all of it is still there."""
+        """Return the result of an earlier call with the same inputs, if its files still exist."""
         known = self._known.get(stage.name, {})
         if known.get("status") != "done" or known.get("stamp") != stamp:
             return None
-        if any(ended.status == "done" for ended in self.ended):  # an earlier stage has changed
+        if any(ended.status == "done" for ended in self.ended):  # an earlier stage was run again
             return None
         document = self._document(stage)
         if not all(path.exists() for path in (*stage.writes, document)):
@@ -186,14 +186,14 @@ class Work:
         return Ended(**known | {"status": "kept"}, document=_parsed(document.read_text("utf-8")))
 
     def _stamp(self, stage: Stage) -> str:
-        """Hash all that decides a result: the command, the user's files, and the stages before."""
+        """Hash what a result depends on: the command, the user's files, and earlier stages."""
         parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
         text = os.fsencode("\n".join(parts))
         self._stamps.append(hashlib.blake2b(text, digest_size=12).hexdigest())
         return self._stamps[-1]
 
     def _clear(self, stage: Stage) -> None:
-        """Remove what an earlier call made of the stage; a run, which took long, is put aside."""
+        """Remove the stage's files from an earlier call, or move them aside if it can resume."""
         for path in stage.writes:
             if not path.exists() or not path.resolve().is_relative_to(self.out.resolve()):
                 continue
@@ -216,14 +216,14 @@ class Work:
 
 @contextmanager
 def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
-    """Run a stage's other command in a process of its own; yield what waits for its exit code.
+    """Run a stage's second command as a process; yield a function that waits for its exit code.
 
-    Its output is shown if it fails. It does not outlive the block.
+    Its last lines are shown if it fails. It is terminated at the end of the block.
     """
     if not stage.beside:
         yield lambda: int(ExitCode.OK)
         return
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # beside another, each has a core
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # one core for each of the two
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "restock", *stage.beside],
@@ -247,7 +247,7 @@ def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
 
 
 class _Both:
-    """A stream, with a copy of what is written to it."""
+    """A stream that also copies what is written to it."""
 
     def __init__(self, stream: Any, copy: io.StringIO) -> None:
         self._stream, self._copy = stream, copy
@@ -261,7 +261,7 @@ class _Both:
 
 
 def speaker(console: Console) -> Callable[[str], None]:
-    """Return what prints a line of markup on a console at once: what is on stderr comes after."""
+    """Return a function that prints a line of markup and flushes it, so that stderr comes after."""
 
     def say(line: str) -> None:
         console.print(line, soft_wrap=True)
@@ -284,7 +284,7 @@ def _parsed(text: str) -> Any:
 
 
 def _fingerprint(path: Path) -> str:
-    """Return the sizes and times of a user's file or folder, as a text to compare."""
+    """Return names, sizes and times of a user's file or folder, as text to compare."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     parts = []
     for file in filter(Path.is_file, files):
