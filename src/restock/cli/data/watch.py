@@ -242,7 +242,7 @@ class Arrivals:
                 self.news.append(("back", folder, ""))
             try:
                 yield from recordings_in(folder)
-            except RecordingError:  # none yet, or the folder has just gone: the next look reports it
+            except RecordingError:  # none yet, or the folder has just gone: reported next time
                 continue
 
     def _wait(self, path: Path, why: str) -> None:
