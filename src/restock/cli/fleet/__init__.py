@@ -1,1 +1,1 @@
-"""Verbs about a whole store: its coverage, what differs, its labels, and keeping it in order."""
+"""Verbs about a whole store: its coverage, differences, labels and maintenance."""

@@ -55,7 +55,7 @@ class CoverageCommand:
     """Print the table as JSON, one object per condition."""
 
     def run(self) -> None:
-        """Ask, print, and write the page."""
+        """Measure the coverage, print it, and write the page."""
         from restock.files import expect_file_place
         from restock.replay.store.novelty import explain_novel_rows, is_quick, novel_rows
         from restock.replay.store.store import Store
@@ -100,7 +100,7 @@ class CoverageCommand:
         drift: Drift | str
         try:
             drift = measure_drift(store)
-        except RestockError as error:  # the logs do not show it
+        except RestockError as error:  # the logs cannot show drift
             drift = str(error)
         advance(1, "charts")
         return write_page(coverage_page(store, missing, drift), out)
@@ -203,7 +203,7 @@ def _missing(
     min_rows: int = 0,
     unit: Literal["missions", "hours"] | None = None,
 ) -> tuple[ShoppingList, dict[str, Any]]:
-    """Return what fills a store's gaps, and all that `restock coverage gaps --json` prints."""
+    """Return what fills a store's gaps, and the document that `restock coverage gaps` prints."""
     from restock.replay.fleet.gaps import find_gaps
     from restock.replay.fleet.shopping_list import document, shopping_list
     from restock.train.twin.missions import KINDS
@@ -283,7 +283,7 @@ class DriftCommand:
     """Print one JSON document: {"findings", "notes", "tests", …}."""
 
     def run(self) -> int:
-        """Measure and print."""
+        """Measure the drift and print it."""
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 

@@ -72,7 +72,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
 
 
 def _kind_of(place: str) -> str:
-    """Tell a panel or a run by its own file; everything else is taken for a store."""
+    """Recognise a panel or a run by its header file; anything else counts as a store."""
     from restock.replay.panel.panel import HEADER
     from restock.replay.places import RUN_CONFIG
 
@@ -165,7 +165,7 @@ def _same(*names: str) -> dict[str, str]:
 
 
 def _lines(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
-    """Return columns of the rows under titles: of both sides, if they have those."""
+    """Select columns and rename them to their titles; a column with two sides becomes two."""
     return [
         {title: value for name, of in columns.items() for title, value in _cells(row, name, of)}
         for row in rows
@@ -181,7 +181,7 @@ def _cells(row: dict[str, Any], name: str, title: str) -> Iterator[tuple[str, An
 
 
 def _value(name: str, value: Any) -> Any:
-    """Return shares in percent, and other values cut on a terminal: --json has them whole."""
+    """Convert shares to percent, and cut long texts on a terminal; --json has the full values."""
     if name.endswith("share"):
         return None if value is None else round(100 * value, 2)
     if isinstance(value, int | float):

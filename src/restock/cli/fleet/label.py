@@ -44,7 +44,7 @@ class LabelCommand:
     """Print one JSON document: {"version", "recordings": [{"recording_id", "changed", …}]}."""
 
     def run(self) -> int:
-        """Label, and say what changed."""
+        """Label the transitions again, and print what changed."""
         from restock.ingest.relabel import open_for_relabel, relabel_store
 
         store = open_for_relabel(self.store)

@@ -1,4 +1,4 @@
-"""`restock review`: a page on which people judge labels, and their verdicts into the store."""
+"""`restock review`: serves a page on which people judge labels, and stores their verdicts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from restock.ingest.store.location import Location
     from restock.replay.review.journal import Written
 
-NONE = "none"  # in place of a file: takes all corrections out
+NONE = "none"  # given instead of a file: removes all corrections
 
 
 @dataclass
@@ -45,7 +45,7 @@ class ReviewCommand:
     page its {"address"}, of a new file {"file"}."""
 
     def run(self) -> int:
-        """Serve, write a file, or take one."""
+        """Serve the page, write a file of events, or read a file of verdicts."""
         from restock.ingest.store.location import Location
 
         place = Location.of(self.store)
@@ -134,7 +134,7 @@ class ReviewCommand:
             written = review.write()
         finally:
             review.close()
-        if self.json:  # stdout has its one document already
+        if self.json:  # stdout already has its document
             output.say(f"{written.taken} verdicts are written, {len(written.held_back)} held back")
         else:
             print_written(written, "no verdict is new")
@@ -147,7 +147,7 @@ NOTHING = "no uncertain event is left to review"
 def print_written(
     written: Written, nothing: str, *, left_open: int = 0, dry_run: bool = False
 ) -> None:
-    """Print what verdicts changed."""
+    """Print what the verdicts changed, and the verdicts that were not written."""
     for why in written.held_back:
         output.print_text(f"held back: {why}")
     if not written.outcomes:

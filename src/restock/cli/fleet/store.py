@@ -1,4 +1,4 @@
-"""`restock store`: join a store's files, take recordings out of it, and compare its checksums."""
+"""`restock store`: joins a store's files, removes recordings from it, and checks its checksums."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CompactCommand:
     {"joined_again", "dropped", "lost", "unnamed_transitions"}."""
 
     def run(self) -> ExitCode:
-        """Compact, and report what became of the files."""
+        """Join the files, and print how many there were and are."""
         from restock.ingest.store.writer import StoreWriter, compact
 
         store = StoreWriter(self.store)
@@ -109,7 +109,7 @@ class CompactCommand:
         return ExitCode.LOSSY if done.dropped else ExitCode.OK
 
 
-SHOWN = 3  # recordings whose paths stand in the command that ingests them again
+SHOWN = 3  # recordings to name in the command that ingests them again
 
 
 @dataclass
@@ -143,7 +143,7 @@ class RemoveCommand:
     "episodes", "corrections", "tags"}], "left", "version_before", "version", "dry_run"}."""
 
     def run(self) -> ExitCode:
-        """Remove, and say what was removed and how to get it back."""
+        """Remove the recordings, and print how to get them back."""
         from restock.ingest.store.removal import remove_recordings
         from restock.ingest.store.writer import StoreWriter
 
@@ -176,7 +176,7 @@ class RemoveCommand:
         return ExitCode.OK
 
     def _lines(self, done: Removed) -> list[str]:
-        """Say what the table does not."""
+        """Say how much was removed, and how to get it back."""
         from restock.ingest.store.writer import RETENTION_HOURS
 
         what = counted(len(done.recordings), "recording")
@@ -223,7 +223,7 @@ class VerifyCommand:
     """Print one JSON document: {"files", "damaged": [{"file", "remedy"}]}."""
 
     def run(self) -> ExitCode:
-        """Verify, and list what is damaged."""
+        """Verify all files, and list the damaged ones."""
         from restock.ingest.store.damaged_files import verify_store
         from restock.replay.panel.panel import HEADER
 

@@ -70,7 +70,7 @@ class CompareCommand:
 
 
 def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
-    """Name each arm by its run, or by what its runs are all called but for a seed."""
+    """Name each arm by its run, or by the common name of its runs without the seed."""
     names = []
     for paths in (first, second):
         bare = {path.name.rstrip("-_.0123456789") for path in paths}

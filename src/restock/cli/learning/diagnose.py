@@ -82,7 +82,7 @@ class DiagnoseCommand:
             if found is None and self.twin:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = None
-        # It confirms what the run's own figures show: no further run can tell if rows are at fault.
+        # Confirm the verdict of the run's own figures: a further run cannot show that rows are bad.
         if self.confirm is not None:
             confirmation = confirm(
                 runs[0],

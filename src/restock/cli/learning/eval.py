@@ -1,4 +1,4 @@
-"""`restock eval`: a run's policy in the twin, or off-policy on logs alone."""
+"""`restock eval`: evaluates a run's policy in the twin, or off-policy on logs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from restock.errors import ExitCode, counted, policy_words
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpePlan
 
-# Options that say what is driven, and what becomes of it.
+# Options that apply only if episodes are driven.
 _DRIVES = ("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "video")
 
 
@@ -201,7 +201,7 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
 
 
 def show_off_policy(plan: OpePlan, rows: list[dict[str, Any]]) -> None:
-    """Print a row per measure and condition, and why weighting is refused if it is."""
+    """Print a row per measure and condition, and why an importance-weighted estimate is refused."""
     cells: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         key = row["measure"], row["condition"]

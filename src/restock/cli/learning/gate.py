@@ -1,4 +1,4 @@
-"""`restock gate`: show that a policy is not worse than what drives today, or say where not."""
+"""`restock gate`: tests whether a policy is shown not to be worse than what drives today."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ class GateCommand:
 
 
 def _margins(text: str) -> dict[str, float]:
-    """Read `success=0.05,bumps_per_km=1`.
+    """Parse margins such as `success=0.05,bumps_per_km=1`.
 
     Raises:
-        ConfigError: a part is no name and number.
+        ConfigError: a part is not NAME=NUMBER.
     """
     found = {}
     for part in names_in(text):

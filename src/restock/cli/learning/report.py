@@ -58,7 +58,7 @@ class ReportCommand:
         with progress("report", None):
             if self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
                 page = self.out or self.run_directory / "report.html"
-                expect_file_place(page, "--out")  # of a store alone it would be lost with it
+                expect_file_place(page, "--out")  # a page inside a store would be lost with it
                 path = write_page(history_page(self.run_directory), page)
             else:
                 path = build_report(self.run_directory, self.out)

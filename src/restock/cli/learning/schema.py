@@ -1,4 +1,4 @@
-"""`restock profile schema`: what a TOML file may say, for editors."""
+"""`restock profile schema`: prints what a TOML file may contain, for editors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from restock.cli import output
 from restock.cli.words import Positional
 from restock.errors import ConfigError
 
-# name -> the files that it is of
+# name of a config -> the files that have it
 CONFIGS: Mapping[str, str] = {
     "train": "`restock train --config`",
     "mixture": "`restock mix --mixture`",
@@ -85,7 +85,7 @@ def _kinds() -> dict[str, type]:
 
 
 def _conditions_in_files(schema: dict[str, Any]) -> None:
-    """Let a `[[condition]]` name a .sql file in place of its `sql`."""
+    """Allow a `[[condition]]` to name a .sql file instead of giving its `sql`."""
     condition = schema["$defs"]["Condition"]
     condition["properties"]["file"] = {
         "type": "string",

@@ -1,4 +1,4 @@
-"""`restock train`: methods x seeds, ending in one comparison."""
+"""`restock train STUDY.toml`: trains every arm of a study with every seed, and compares them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class StudyInterrupted(RestockError):
-    """Ctrl-C; what has finished is kept."""
+    """Raised after Ctrl-C; finished runs are kept."""
 
     exit_code = ExitCode.INTERRUPTED
 
@@ -87,7 +87,7 @@ class StudyCommand:
         return int(ExitCode.FAILED if refused else ExitCode.OK)
 
     def _show(self, plan: StudyPlan) -> int:
-        """Print the runs of a study, which is checked."""
+        """Check the study, and print the runs that it would train."""
         from restock.train.study.study import check_jobs
         from restock.train.study.study_run import check_mixtures
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing
     from restock.replay.trace.origin import Origin
 
-_LONG = 6  # entries of a list that are printed
-_TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
+_LONG = 6  # a longer list is cut to this many entries
+_TABLES = ("clocks", "signals", "stand_ins")  # entries of a manifest that only --json prints
 
 
 @dataclass
@@ -43,7 +43,7 @@ class TraceCommand:
     """Print one JSON document (without ROW: a list)."""
 
     def run(self) -> None:
-        """Trace, and print what was found."""
+        """Trace the row, or list rows, and print the result."""
         from restock.replay.trace.trace import listed_rows, trace_row
 
         if self.row is None:
@@ -66,7 +66,7 @@ class TraceCommand:
 
 
 def document(trace: tracing.Trace) -> dict[str, Any]:
-    """Return a trace as `--json` prints it; what is not known is null."""
+    """Return a trace as `--json` prints it; an unknown value is None."""
     origin = asdict(trace.origin) if trace.origin is not None else None
     names = (
         *("transition", "reward_parts", "store", "recording", "moment", "topics"),
@@ -132,7 +132,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:
-    """Print a table of names and values, without empty ones."""
+    """Print a table of names and values, without empty values."""
     known = {name: value for name, value in (values or {}).items() if value not in (None, "", [])}
     if known:
         rows = [{"": name, "value": _short(value)} for name, value in known.items()]

@@ -1,4 +1,4 @@
-"""`restock train`: offline warm-up on the panel, then online in the twin."""
+"""`restock train`: trains offline on the panel, then online in the twin."""
 
 from __future__ import annotations
 
@@ -157,8 +157,8 @@ def _train(prepared: Prepared) -> TrainResult:
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Let the first Ctrl-C stop the loop with a checkpoint, and the second one at once."""
-    # On a thread: a handler must not print while what it interrupts does.
+    """Make the first Ctrl-C stop the loop with a checkpoint, and the second one at once."""
+    # Printed on a thread, because the handler may interrupt code that is printing.
     reported = Thread(target=say, args=(_STOPPING,))
     stopping = False
 
@@ -220,7 +220,7 @@ def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
         if result is not None:
             mean = result.success_mean if result.success else "no goal"
             rows.append({"policy": name, **result.success, "mean": mean})
-    if rows:  # else nothing drove
+    if rows:  # empty if nothing drove
         print_table(rows, title="success on the fixed episodes, greedy")
     if fed:
         print_table(fed_table(fed), title="what the critic was fed: % of all rows")
@@ -232,7 +232,7 @@ def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
 
 
 def describe_run(prepared: Prepared) -> str:
-    """Describe the run, and what not to expect of it, in a line each."""
+    """Describe the run, and list settings and conditions that will have no effect, one per line."""
     from restock.train.dqn.config import PLANNER
     from restock.train.twin.floors.floors import open_floors
     from restock.train.twin.physics.episode import sealed
@@ -272,9 +272,9 @@ def describe_run(prepared: Prepared) -> str:
 
 
 def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
-    """Describe what will fill a run's batches, and what will be short.
+    """Describe which quotas will fill a run's batches, and which strata will be short.
 
-    `fed` is the panel's part of config.json.
+    `fed` is the part of config.json about the panel.
     """
     from restock.train.run.replay_audit import SHORT
 
@@ -307,7 +307,7 @@ def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
 
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
-    """Say why a run has learned nothing, or nothing in the twin; None if it has."""
+    """Explain why a run has learned nothing, or nothing in the twin; None if it has learned."""
     if outcome.online_updates:
         return None
     if not outcome.gradient_steps:
@@ -352,7 +352,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
 
 
 def _not_evaluated(document: dict[str, Any]) -> list[str]:
-    """Return the conditions that the twin cannot show, and why."""
+    """Return a sentence for each condition that the twin cannot show, with the reason."""
     from restock.ingest.task.task import LIDAR_SIGNALS
 
     return [

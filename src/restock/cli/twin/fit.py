@@ -1,4 +1,4 @@
-"""`restock twin fit`: effective parameters of the robot, from its commands and what it did."""
+"""`restock twin fit`: fits effective parameters of the robot to its commands and motion."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FitCommand:
     """Print one JSON document: {"fits": [{"estimates", "warnings", "held_out", …}], "out"}."""
 
     def run(self) -> int:
-        """Fit, print, write."""
+        """Fit the parameters, print and write them."""
         from restock.files import expect_file_place
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fitted_twin import write_fit

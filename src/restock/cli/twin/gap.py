@@ -1,4 +1,4 @@
-"""`restock twin gap`: how far the twin is from the logs, and where not to trust it."""
+"""`restock twin gap`: measures how far the twin is from the logs, and where not to trust it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class GapCommand:
     "not_done", "about"}."""
 
     def run(self) -> int:
-        """Measure, print, write."""
+        """Measure the gap, print and write it."""
         from restock.replay.store.store import Store
         from restock.report import gap_page, write_page
         from restock.train.twin.calibration.gap import measure_gap

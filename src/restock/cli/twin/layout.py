@@ -1,4 +1,4 @@
-"""`restock twin layout`: what a floor is, from a name, a file, a map, or what recordings show."""
+"""`restock twin layout`: describes a floor from a name, file or map, or made from recordings."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class LayoutCommand:
     """Print the description as JSON."""
 
     def run(self) -> int:
-        """Print, and write what was asked for."""
+        """Print the floor's description, and write the requested files."""
         from restock.files import write_text
         from restock.train.twin.env.render import draw_floor, write_png
         from restock.train.twin.floors.floor_files import write_floor

@@ -1,4 +1,4 @@
-"""`restock twin record`: drive the simulated stand-in and write what a real robot would log."""
+"""`restock twin record`: drives a simulated robot, and writes what a real one would log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from restock.replay.fleet.missions_file import MissionsFile
     from restock.train.twin.env.interface import Policy
 
-LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
+LEARNED = "dqn"  # behaviour policy's name for a policy that `restock train` made
 
 
 @dataclass
@@ -75,7 +75,7 @@ class RecordCommand:
     """Print one JSON document: {"path", "format", "missions", "messages", "topics", …}."""
 
     def run(self) -> None:
-        """Record, and print what was recorded."""
+        """Drive and record the missions, and print a summary."""
         from restock.files import expect_place
         from restock.ingest.profile.tag_rules import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
@@ -169,11 +169,11 @@ def _missions(text: str | None) -> int | MissionsFile | None:
 
 
 def load_policy(name: str) -> Policy | None:
-    """Return the policy that `run:DIRECTORY` or `onnx:FILE` names; None for scripted ones.
+    """Return the policy that `run:DIRECTORY` or `onnx:FILE` names; None for a scripted driver.
 
     Raises:
-        ConfigError: no such policy, or one of another task.
-        RunError: a run without a policy, or a damaged one.
+        ConfigError: there is no such policy, or it is for another task.
+        RunError: the run has no policy, or is damaged.
     """
     from restock.train.twin.recording.fleet import SCRIPTED
 
@@ -189,7 +189,7 @@ def load_policy(name: str) -> Policy | None:
             where="--policy",
             remedy=f"choose one of {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
         )
-    if policy.version:  # made by Restock: the same policy has the same tag from a run or a file
+    if policy.version:  # made by Restock, so a run and a file with the same policy get the same tag
         policy.name = LEARNED
     else:
         file = Path(name.removeprefix("onnx:"))

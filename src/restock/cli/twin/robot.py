@@ -1,4 +1,4 @@
-"""`restock twin robot`: the robot that the twin builds of a profile, and whether it drives."""
+"""`restock twin robot`: builds the robot of a profile in the twin, and tests how it drives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 from restock.cli import output
 from restock.cli.words import Positional
 
-FRICTION = 0.8  # of the floor
+FRICTION = 0.8  # coefficient of the floor
 
 
 @dataclass
@@ -29,7 +29,7 @@ class RobotCommand:
     (parts outside the outline)}."""
 
     def run(self) -> int:
-        """Build it and drive every action."""
+        """Build the robot, drive every action and print the results."""
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
         from restock.train.twin.physics.model import (
@@ -45,7 +45,7 @@ class RobotCommand:
 
         profile = load_profile(self.profile)
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
-        blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot drive
+        blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot simulate
         model = robot_model(profile.robot, profile.task.body)
         facts = outlined(profile.task.body) + measured(model, profile.robot)
         beyond = outside(model, profile.task.body)
