@@ -1,11 +1,9 @@
-"""Descriptions of a robot by strangers: URDF.
-
-Of a URDF it reads the links, where their joints put them, and how large their shapes are.
+"""Reader of robot descriptions (URDF): links, their positions by joints, and their shapes' sizes.
 
 The text is untrusted: entities and documents that are too long are refused, invalid numbers are
 read as unknown, and no other file is opened, so a mesh has no size. The base is the link with a
-usual name, else the root link. Whether that is the body or a footprint below it makes no
-difference: heights are over the floor.
+usual name, or else the root link. It may be the body or a footprint below it, as heights are
+measured from the floor.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from numpy.typing import NDArray
 BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 F64 = NDArray[np.float64]
-MAX_LETTERS = 4_000_000  # letters of a description
+MAX_LETTERS = 4_000_000  # characters of a description
 MAX_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
 HEAVIEST_KG = 100_000.0  # of a link
@@ -30,7 +28,7 @@ HEAVIEST_KG = 100_000.0  # of a link
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint, from its parent to its child."""
+    """A joint between a parent link and a child link."""
 
     name: str
     kind: str
@@ -41,16 +39,19 @@ class Joint:
 
 @dataclass(frozen=True)
 class Description:
-    """A description that was read."""
+    """A parsed robot description."""
 
     name: str
     links: dict[str, ET.Element]
     joints: list[Joint]
-    base: str  # the link that poses are of
+    base: str  # name of the link whose pose is the robot's
     root: ET.Element
 
     def places(self, kinds: Collection[str] = ANY) -> dict[str, Place]:
-        """Return where links are that joints of these kinds connect to the base, all at zero."""
+        """Return the places of links that joints of these kinds connect to the base.
+
+        All joints are at position 0.
+        """
         children: dict[str, list[Joint]] = {}
         for joint in self.joints:
             if joint.kind in kinds:
@@ -68,7 +69,7 @@ class Description:
 
 
 def read_description(text: str) -> Description | str:
-    """Read a description, or say why it cannot be used."""
+    """Parse a description; return the reason as text if it cannot be used."""
     if len(text) > MAX_LETTERS:
         return f"{len(text):,} characters are too many for a robot's description"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -103,14 +104,14 @@ def read_description(text: str) -> Description | str:
 
 
 def _of_xacro(element: ET.Element) -> bool:
-    """Return whether it is still to be expanded by xacro."""
+    """Return whether an element must still be expanded by xacro."""
     values = element.attrib.values()
     in_namespace = element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]
     return in_namespace or any("${" in value or "$(" in value for value in values)
 
 
 def _no_base(roots: list[str]) -> str:
-    """Say why no link can be taken for the base."""
+    """Describe why no link can be the base."""
     why = "every link hangs on another"
     if roots:
         more = f" and {len(roots) - 4:,} more" if len(roots) > 4 else ""
@@ -123,11 +124,11 @@ def _no_base(roots: list[str]) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """The place of a link in the base's frame."""
+    """The pose of a link in the base's frame."""
 
     rotation: F64  # (3, 3)
     at_m: F64  # (3,)
-    rigid: bool  # joined by fixed joints alone
+    rigid: bool  # only fixed joints lie between base and link
 
     def then(self, origin: ET.Element | None, *, rigid: bool = True) -> Place:
         xyz, rpy = (three(None if origin is None else origin.get(key)) for key in ("xyz", "rpy"))
@@ -136,7 +137,10 @@ class Place:
 
 
 def extent(link: ET.Element, place: Place) -> tuple[F64, F64] | None:
-    """Return the lowest and highest corner of a link's collision shapes, else visible ones."""
+    """Return the lowest and highest corner (3,) of a link's collision shapes, or else visual ones.
+
+    None if no shape has a known size.
+    """
     for kind in ("collision", "visual"):
         boxes = [
             box
@@ -176,16 +180,13 @@ def _rotation(rpy: F64) -> F64:
 
 
 def three(text: str | None) -> F64:
-    """Return three numbers of a description, 0 for those it lacks."""
+    """Parse up to three numbers of a description; missing ones are 0."""
     numbers = [number(part) for part in itertools.islice((text or "").split(), 3)]
     return np.array([*numbers, *[0.0] * (3 - len(numbers))])
 
 
 def lengths(text: str | None, count: int) -> F64:
-    """Return so many numbers (count,) of 0 or more.
-
-    All NaN if the text does not have just these.
-    """
+    """Parse exactly `count` numbers of 0 or more, (count,); all NaN if the text has others."""
     parts = (text or "").split(maxsplit=count)
     found = np.array([number(part) for part in parts[:count]])
     sound = len(parts) == count and bool((found >= 0).all())
@@ -193,7 +194,7 @@ def lengths(text: str | None, count: int) -> F64:
 
 
 def number(text: Any) -> float:
-    """Read a number of a description; NaN, which no outline survives, if it is none."""
+    """Parse a number of a description; NaN, which makes an outline unknown, if it is invalid."""
     try:
         return float(text) if abs(float(text)) < 1e6 else float("nan")
     except (TypeError, ValueError):

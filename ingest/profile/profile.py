@@ -2,17 +2,17 @@
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or in hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
-(which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
-transforms), `origin_m` (of positions), `[motion]` (speeds from poses), `[signals.*]` (custom
-columns), `[cameras.*]` (frames that are kept), `[tags]` (whose drive it is), `[robot]` (what the
-twin builds), `[limiter]` (of a policy's commands) and `[[zone]]` (named rectangles of the map).
-`load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
-one of yours.
+(topics that fill the signals), `[command_sources.*]` (drivers whose command it may be), `[frames]`
+(poses from transforms), `origin_m` (origin of positions), `[motion]` (speeds from poses),
+`[signals.*]` (custom columns), `[cameras.*]` (frames to keep), `[tags]` (robot, site and more),
+`[robot]` (model for the twin), `[limiter]` (of a policy's commands) and `[[zone]]` (named
+rectangles of the map). `load_profile("warehouse_amr")` reads a profile that comes with Restock,
+`load_profile("my_robot.toml")` a file.
 
-Stores, panels and runs carry a profile as one TOML text that needs no other file (`profile_toml`):
-the SQL of each `[[condition]]` that was a file is in it, and shipped conditions stay names. The
-text may come from a stranger, and is read as a profile file is: values are checked by type, SQL
-runs in the same sandbox, and no file is opened.
+Stores, panels and runs contain a profile as one TOML text that needs no other file (see
+`profile_toml`). It includes the SQL of each `[[condition]]` that was a file, and only the names of
+shipped conditions. The text may come from a stranger and is read like a profile file: values are
+type-checked and SQL runs in the same sandbox; but no file is opened.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _NOT_IN_ROWS = ("conditions", "exposures", "condition", "tags", "noise", "robot"
 
 
 class Profile(Checked, frozen=True, dict=True):
-    """One kind of robot. Read with `load_profile`."""
+    """A profile of one kind of robot. Read it with `load_profile`."""
 
     name: str
     task: Task
@@ -95,16 +95,16 @@ class Profile(Checked, frozen=True, dict=True):
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
-    behaviour_policy: str = "unknown"  # the driver, if no topic says so
-    # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
+    behaviour_policy: str = "unknown"  # the driver, if no topic names it
+    # Behaviour policy -> its commands (a person's, navigation's), before one source is chosen.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
-    # The topic that was chosen among them, if the command is that one smoothed or limited: who
-    # drives is the source whose command it repeats.
+    # Topic of the chosen source's commands, if the robot's command is a smoothed or limited copy.
+    # The driver is the source whose command this topic repeats.
     command_through: Input | None = None
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
-    # Subtracted from poses, goals and plans, which are in metres: UTM coordinates, for example.
+    # Subtracted from poses, goals and plans in metres, for example in UTM coordinates.
     origin_m: tuple[float, float] | None = None
     frames: Frames | None = None
     motion: Motion | None = None
@@ -117,17 +117,17 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def conditions(self) -> list[Condition]:
-        """Return the conditions that label this robot's steps: outcomes."""
+        """Return the outcomes that label this robot's steps."""
         return self._of("outcome", self.shipped_conditions)
 
     @property
     def exposures(self) -> list[Condition]:
-        """Return the situations that are listed beside them."""
+        """Return the exposures that label this robot's steps."""
         return self._of("exposure", self.shipped_exposures)
 
     @property
     def constants(self) -> dict[str, float]:
-        """Return the names that the SQL of its conditions may use beside the columns of steps."""
+        """Return the constants that the SQL of conditions may name beside the columns of steps."""
         return self.noise.constants | self.task.condition_limits
 
     def _of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
@@ -138,11 +138,11 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def definitions(self) -> list[Condition]:
-        """Return both, conditions first."""
+        """Return outcomes and exposures, outcomes first."""
         return [*self.conditions, *self.exposures]
 
     def shown_by_logs(self, conditions: Sequence[Condition]) -> list[Condition]:
-        """Return the conditions that this robot's logged steps can show."""
+        """Return the conditions that are known on this robot's logged steps."""
         in_hindsight = self.goal_source == "hindsight"
         return reported(conditions, lidar=self.task.lidar, driven_plan=in_hindsight)
 
@@ -152,10 +152,10 @@ class Profile(Checked, frozen=True, dict=True):
 
     @cached_property
     def hash(self) -> str:
-        """Return 12 hex digits of everything in the profile that rows depend on.
+        """Return a hash of everything in the profile that rows depend on, 12 hex digits.
 
-        That leaves out conditions, which can be changed without the recordings (labels depend on
-        `labels_version`), their [noise], whose drive it is, and what only the twin needs of it.
+        It leaves out the conditions and their [noise], as rows can be relabelled without the
+        recordings and have a `labels_version`; the [tags]; and what only the twin needs.
         """
         values = _given(msgspec.to_builtins(self))
         rest = {key: value for key, value in values.items() if key not in _NOT_IN_ROWS}
@@ -163,14 +163,14 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def transform_topics(self) -> tuple[str, ...]:
-        """Return the topics of the transforms that `[frames]` needs."""
+        """Return the topics of transforms that `[frames]` needs."""
         return (self.frames.topic, self.frames.static_topic) if self.frames else ()
 
     @property
     def sources(self) -> dict[str, Input]:
-        """Return the inputs, and the sources of commands as `command_sources.NAME`.
+        """Return the inputs, the sources of commands as `command_sources.NAME`, `command_through`.
 
-        Sources are optional, as are goal and plan if the task has no goal.
+        All but the inputs are optional, and so are goal and plan if the task has no goal.
         """
         optional = {
             name: msgspec.structs.replace(source, optional=True)
@@ -195,7 +195,7 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def fallbacks(self) -> dict[str, str]:
-        """Return what is used instead of each input that the profile leaves out."""
+        """Return what replaces each input that the profile leaves out, as text."""
         given = dict(self.inputs.items())
         fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
         if is_motion(self.inputs.command.type):
@@ -225,11 +225,11 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def goal_source(self) -> GoalSource | None:
-        """Return where the goals of its rows come from; None if they have none."""
+        """Return where the goals of rows come from; None if rows have no goal."""
         return self.goal.source if self.task.goal == "route" else None
 
     def zone_of(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> list[str]:
-        """Return the name of the first zone that holds each point (N,), or `elsewhere`."""
+        """Return the name of the first zone that contains each point (N,), or `elsewhere`."""
         x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
         index = np.full(x.shape, len(self.zones), np.intp)
         for position in reversed(range(len(self.zones))):
@@ -245,11 +245,10 @@ def shipped_profiles() -> list[str]:
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
-    """Load a shipped profile by its name, or one of yours by its path.
+    """Load a shipped profile by its name, or a profile file by its path.
 
     Raises:
-        ConfigError: no such profile, or its TOML says something Restock cannot use; names the
-            file and the key.
+        ConfigError: there is no such profile, or its TOML is invalid; names the file and the key.
     """
     where = str(name_or_path)
     if where in (names := shipped_profiles()):
@@ -271,10 +270,10 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 
 def parse_profile(text: str, *, where: str) -> Profile:
-    """Parse a profile from its TOML text, which names no file; `where` names it in errors.
+    """Parse a profile from TOML text that names no files; `where` names it in errors.
 
     Raises:
-        ConfigError: its TOML says something Restock cannot use.
+        ConfigError: the TOML is invalid.
     """
     return _typed(parse_toml(text, where=where), where=where, folder=None)
 
@@ -282,7 +281,7 @@ def parse_profile(text: str, *, where: str) -> Profile:
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
     document = with_files(document, folder, where)
     signals = document.get("signals")
-    # Each by itself first: msgspec's paths leave out the keys of a table of tables.
+    # Check each on its own first, as msgspec's error paths leave out the keys of nested tables.
     for name, table in signals.items() if isinstance(signals, dict) else ():
         typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
     cameras = document.get("cameras")
@@ -296,16 +295,16 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
             raise ConfigError(what, where=where)
     profile = typed(document, Profile, where=where)
     if not profile.inputs.scans:
-        profile = without_lidar(profile)  # whatever number of sectors it gives
+        profile = without_lidar(profile)  # it may give a number of sectors all the same
     check_profile(profile, where)
     return profile
 
 
 def without_lidar(profile: Profile) -> Profile:
-    """Return the profile of the same robot without a lidar: without scans and sectors.
+    """Return the profile without lidar: no scans and 0 sectors.
 
     Raises:
-        ConfigError: its task asks for tracks.
+        ConfigError: its task has tracks.
     """
     if profile.task.tracks:
         raise ConfigError(
@@ -321,7 +320,7 @@ def without_lidar(profile: Profile) -> Profile:
 
 
 def profile_toml(profile: Profile) -> str:
-    """Write the profile as TOML with every default; `parse_profile` gives an equal one."""
+    """Format the profile as TOML with every default; `parse_profile` returns an equal profile."""
     values = _given(msgspec.to_builtins(profile))
     plain, tables = [], []
     for name, value in values.items():
@@ -336,7 +335,7 @@ def profile_toml(profile: Profile) -> str:
 
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
-    """Return the profile with other conditions; those that come with Restock go by their names."""
+    """Return the profile with these conditions instead; shipped ones are listed by name."""
     known = shipped(profile.constants) | shipped(profile.constants, "exposure")
     named = [c for c in conditions if known.get(c.name) == c]
     return msgspec.structs.replace(
@@ -348,7 +347,7 @@ def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profil
 
 
 def _given(value: Any) -> Any:
-    """Return plain values without None, which TOML lacks and which is always the default."""
+    """Return built-in values without None: TOML has no null, and None is always the default."""
     if isinstance(value, dict):
         return {key: _given(item) for key, item in value.items() if item is not None}
     return [_given(item) for item in value] if isinstance(value, list | tuple) else value
@@ -359,9 +358,9 @@ def _lines(table: dict[str, Any]) -> list[str]:
 
 
 def not_live(profile: Profile) -> dict[str, str]:
-    """Say what a profile takes that a running robot lacks, each with what to give instead.
+    """Return what prevents a profile from running live: each problem, with what to do instead.
 
-    Empty if the profile can be followed live.
+    Empty if the profile can run live.
     """
     found: dict[str, str] = {}
     pose = profile.inputs.pose
@@ -483,7 +482,7 @@ def check_profile(profile: Profile, where: str) -> None:
 
 
 def _check_goal(profile: Profile, where: str) -> None:
-    """Check that goals and plans come from somewhere, and from one place alone."""
+    """Check that goals and plans have exactly one source."""
     rules = changed(profile.goal)
     if profile.goal.source == "logged" and rules:
         raise ConfigError(
@@ -518,7 +517,7 @@ def _check_goal(profile: Profile, where: str) -> None:
 
 
 def _check_conditions(profile: Profile, where: str) -> None:
-    """Check that the SQL of the profile's own binds to the columns of steps."""
+    """Check that the SQL of the profile's own conditions, rewards and entries runs on steps."""
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):

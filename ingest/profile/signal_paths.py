@@ -1,20 +1,20 @@
-"""Paths of custom signals: what they say, and what they find in a topic's columns.
+"""Paths of custom signals: their syntax, and the values that they select in a topic's columns.
 
-A signal path names one value of a message, or a list of them:
+A signal path selects one value of a message, or a list of values:
 
     battery.voltage                                  a field
     covariance[0]   status[-1].level                 one element of an array or a sequence
-    velocity[left_wheel]                             the element whose sibling `name[]` says so
-    status[name=battery].values[key=voltage].value   the element in which a field says so
+    velocity[left_wheel]                             the element with that entry in `name[]`
+    status[name=battery].values[key=voltage].value   the element with that value in a field
     ranges[::4]   cells[2:10]   poses[].position.x   several elements: a list
 
-A path with a slice or `[]` gives a list a message; every other gives one value or, where the
-element is not there, none.
+A path with a slice or `[]` gives one list per message. Any other path gives one value, or none if
+the message lacks the element.
 
-`CONVENTIONS` is the one place that knows how messages mark a value that was not measured: a driver
-that measures no yaw rate still publishes one, and marks it as invalid in another field. Inputs,
-custom signals and proposed profiles use it. Such a value is NaN, which is null in rows. The fields
-that name frames, and those of transforms, are here too.
+`CONVENTIONS` defines how messages mark a value that was not measured: a driver that measures no
+yaw rate still publishes one, and marks it as invalid in another field. Inputs, custom signals and
+proposed profiles use it. An invalid value becomes NaN, which is null in rows. The fields that name
+frames, and those of transforms, are here too.
 """
 
 from __future__ import annotations
@@ -38,39 +38,39 @@ if TYPE_CHECKING:
 
 
 Rows = NDArray[np.intp]
-NAMES = "name"  # the sibling that names elements, as in sensor_msgs/JointState
+NAMES = "name"  # field that holds the elements' names, as in sensor_msgs/JointState
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
 _ELEMENT = re.compile(r"(.+)\[(\d{1,6})\]")
 IN = " in "  # between a path and the unit of its values
-UNITS = {  # by the unit of a field: others, and what they are of it
+UNITS = {  # unit of a field -> other units, and their factor to convert to it
     "mps": {"mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
     "radps": {"deg/s": math.pi / 180, "rpm": math.pi / 30},
 }
 
 
 class PathProblem(Exception):
-    """A path that cannot be read, or that a message type does not have; says what there is."""
+    """A path is invalid, or a message type lacks it; the text follows the path in messages."""
 
 
 def element_of(path: str) -> tuple[str, int | None]:
-    """Split a path of one element into the list and its index; None for the whole field."""
+    """Split the path of an element into field and index; the index of a whole field is None."""
     bare = path.partition(IN)[0]
     match = _ELEMENT.fullmatch(bare)
     return (match[1], int(match[2])) if match else (bare, None)
 
 
 def factor_of(key: str, path: str) -> float | None:
-    """Return what turns the values at a path into the unit of the field `key`; None: unknown."""
+    """Return the factor that converts values at a path to the unit of `key`; None: unknown unit."""
     unit = path.partition(IN)[2]
     return UNITS.get(key.rpartition("_")[2], {}).get(unit) if unit else 1.0
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The elements of a repeated field that a path means; `which` None is all of them."""
+    """The elements of a repeated field that a path selects; if `which` is None, all."""
 
     which: int | slice | str | None
-    key: str | None = None  # the field of the element that must say `which`
+    key: str | None = None  # the element's field that must have the value `which`
 
     @property
     def many(self) -> bool:
@@ -79,7 +79,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Step:
-    """One field of a path, and which of its elements."""
+    """One field of a path, and the choice of its elements."""
 
     name: str
     choice: Choice | None = None
@@ -95,17 +95,17 @@ class PathValues:
 
 @dataclass(frozen=True)
 class SignalPath:
-    """A path, read. `text` is as it was written."""
+    """A parsed path. `text` is its original."""
 
     text: str
     steps: tuple[Step, ...]
 
     @classmethod
     def read(cls, text: str) -> SignalPath:
-        """Read a path.
+        """Parse a path.
 
         Raises:
-            PathProblem: it is not written as one.
+            PathProblem: its syntax is invalid.
         """
         steps, at = [], 0
         while at < len(text):
@@ -120,11 +120,11 @@ class SignalPath:
 
     @property
     def lists(self) -> int:
-        """Count the steps that mean several elements: with one or more, the path gives a list."""
+        """Count the steps that select several elements; if there are any, the path gives a list."""
         return sum(step.choice is not None and step.choice.many for step in self.steps)
 
     def leaf(self, upto: int | None = None, *more: str) -> str:
-        """Return the field path to read for it (or for a field beside its step `upto`)."""
+        """Return the field path to decode, or that of the field `more` beside step `upto`."""
         steps = self.steps[:upto]
         last = upto is None and not more
         names = [
@@ -134,7 +134,7 @@ class SignalPath:
         return ".".join([*names, *more])
 
     def beside(self) -> dict[int, str]:
-        """Return the field that each step's choice looks at, by the step's index."""
+        """Return the field that decides each step's choice of element, by the step's index."""
         names = {}
         for place, step in enumerate(self.steps):
             if step.choice is not None and isinstance(step.choice.which, str):
@@ -145,15 +145,16 @@ class SignalPath:
         return names
 
     def wanted(self, *ends: str) -> list[str]:
-        """Return every field path to read; `ends` are fields of the message at the path's end."""
+        """Return all field paths to decode; `ends` are fields of the message at the path's end."""
         values = [f"{self.leaf(len(self.steps))}.{end}" for end in ends] or [self.leaf()]
         return [*values, *self.beside().values()]
 
     def check(self, leaves: Sequence[Leaf], *ends: str) -> list[str]:
-        """Return the kinds (`float64`, `string`, …) that it finds in messages with these fields.
+        """Return the kinds (`float64`, `string`, …) of its values in messages with these fields.
 
         Raises:
-            PathProblem: there is no such field, or it repeats where the path says nothing.
+            PathProblem: there is no such field, or it repeats and the path has no brackets for it,
+                or the reverse.
         """
         kinds = {leaf.path: leaf.kind for leaf in leaves}
         repeats = {
@@ -184,7 +185,7 @@ class SignalPath:
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
     def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> PathValues:
-        """Return the values that it means in these columns (those of `wanted`)."""
+        """Return the values that the path selects in these columns (those of `wanted`)."""
         names = self.beside()
         path = self.leaf() if end is None else f"{self.leaf(len(self.steps))}.{end}"
         column, beside = columns[path], {place: columns[name] for place, name in names.items()}
@@ -194,7 +195,7 @@ class SignalPath:
             if step.choice is None:
                 continue
             parent, position, column = _open(column)
-            # A field of the element opens with it; the names beside it stay at its parent.
+            # Fields inside the element are flattened with it; a `name[]` beside it is not.
             inside = {p for p in beside if p > place or (p == place and step.choice.key)}
             for other in inside:
                 beside[other] = _open(beside[other])[2]
@@ -207,20 +208,20 @@ class SignalPath:
         return PathValues(message, np.asarray(column))
 
 
-ANY = " or "  # between the paths of what may be pressed
+ANY = " or "  # separates the paths of `pressed`
 
 
 def pressed_paths(text: str) -> list[SignalPath]:
-    """Read the paths of a `pressed`: what is pressed if any value at any of them is above 0.
+    """Parse the paths of a field `pressed`, which is true if any value at any path is above 0.
 
     Raises:
-        PathProblem: one of them is not written as a path.
+        PathProblem: the syntax of a path is invalid.
     """
     return [SignalPath.read(part.strip()) for part in text.split(ANY)]
 
 
 def pressed_in(columns: Mapping[str, FieldColumn], text: str, count: int) -> NDArray[np.bool_]:
-    """Return which of so many messages say that it is pressed.
+    """Return in which of `count` messages a value at the paths of `pressed` is above 0.
 
     Raises:
         PathProblem: a value is not a number.
@@ -235,7 +236,7 @@ def pressed_in(columns: Mapping[str, FieldColumn], text: str, count: int) -> NDA
 
 
 def _choice(text: str) -> Choice:
-    """Parse the text between brackets."""
+    """Parse the text between the brackets of a path."""
     text = text.strip()
     if not text:
         return Choice(None)
@@ -253,10 +254,7 @@ def _choice(text: str) -> Choice:
 
 
 def _open(column: FieldColumn) -> tuple[Rows, Rows, FieldColumn]:
-    """Flatten a column of repeated fields.
-
-    Returns the parents of its elements, their indices, and values.
-    """
+    """Flatten a column of lists: return each element's row, index in its list, and value."""
     if isinstance(column, Ragged):
         parent = np.repeat(np.arange(len(column)), column.lengths)
         return parent, np.arange(len(parent)) - column.offsets[:-1][parent], column.values
@@ -268,7 +266,7 @@ def _open(column: FieldColumn) -> tuple[Rows, Rows, FieldColumn]:
 def _chosen(
     choice: Choice, parent: Rows, position: Rows, beside: FieldColumn | None, parents: int
 ) -> Rows:
-    """Return the rows of the chosen elements, in their order."""
+    """Return the positions of the chosen elements in the flattened column, in order."""
     which = choice.which
     if which is None:
         return np.arange(len(parent))
@@ -316,7 +314,7 @@ def _bare(path: str) -> str:
 
 
 def offer(path: str, paths: list[str]) -> str:
-    """Say that a path is not there, and offer those that are."""
+    """Return an error text for a missing field path that suggests similar paths."""
     bare = {_bare(known): known for known in paths}
     ends = {known.split(".")[-1]: known for known in paths}
     near = [bare[name] for name in get_close_matches(_bare(path), bare, n=3)]
@@ -332,28 +330,28 @@ def offer(path: str, paths: list[str]) -> str:
 class Convention:
     """A way in which messages of one type mark values that were not measured.
 
-    `read` takes values (V,) and, for each of them, what the fields `said_by` say of its message; it
-    returns the values with NaN for what was not measured.
+    `read` takes values (V,) and, for each of the fields `said_by`, its values (V,) in the same
+    messages. It returns the values with NaN for those that were not measured.
     """
 
-    type: str  # its last part, as JSON and protobuf have types of other packages' names
-    values: tuple[str, ...]  # fields; with each, all below it
-    said_by: tuple[str, ...]
+    type: str  # last part of the type, as JSON and protobuf types have other package names
+    values: tuple[str, ...]  # fields that it applies to, with all fields below them
+    said_by: tuple[str, ...]  # fields that mark a value as not measured
     read: Callable[..., F64]
-    words: str
+    words: str  # how a value is marked, for messages to the user
 
     @property
     def fields(self) -> list[str]:
-        """Return the field paths to read for it."""
+        """Return the field paths to decode for `said_by`."""
         return [element_of(path)[0] for path in self.said_by]
 
     @property
     def of_messages(self) -> bool:
-        """Return whether a message marks all these values at once, whatever they are."""
+        """Return whether a message marks all of `values` at once, whatever they are."""
         return self.read is _unless_minus_one or self.read is _unless_negative
 
     def flags(self, columns: Mapping[str, FieldColumn]) -> Bools:
-        """Return which messages (N,) give up these values."""
+        """Return which messages (N,) mark their `values` as not measured."""
         said = [said_in(columns, path) for path in self.said_by]
         return np.asarray(np.isnan(self.read(np.zeros(len(said[0])), *said)), np.bool_)
 
@@ -367,9 +365,9 @@ def _unless_negative(values: F64, status: F64) -> F64:
 
 
 def _within(values: F64, low: F64, high: F64) -> F64:
-    """Return the values with NaN outside the limits; -inf is too close to be measured (REP 117)."""
+    """Return the values, NaN outside the limits; -inf (too close, REP 117) becomes `low`."""
     near = np.where(np.isneginf(values), low, values)
-    given = (high > 0) & (low <= high)  # else the driver gives no limits
+    given = (high > 0) & (low <= high)  # otherwise the driver publishes no limits
     return np.where(given & ~((near >= low) & (near <= high)), np.nan, near)
 
 
@@ -385,7 +383,7 @@ CONVENTIONS = (
     _unknown("Imu", "angular_velocity", "angular_velocity_covariance"),
     _unknown("Imu", "linear_acceleration", "linear_acceleration_covariance"),
     _unknown("Imu", "orientation", "orientation_covariance"),
-    # Drivers of wheels alone, or of poses alone, do the same with the other half.
+    # Drivers that measure only wheels, or only poses, mark the other half in the same way.
     _unknown("Odometry", "twist.twist", "twist.covariance"),
     _unknown("Odometry", "pose.pose", "pose.covariance"),
     Convention(  # sensor_msgs/NavSatStatus: STATUS_NO_FIX
@@ -405,8 +403,8 @@ CONVENTIONS = (
         lambda values: values,
         "NaN",
     ),
-    # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". Of
-    # the scans that fill an input, `restock.ingest.task.surroundings` makes clearance.
+    # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". For
+    # the scans of inputs, `restock.ingest.task.surroundings` applies limits of its own.
     Convention(
         "Range", ("range",), ("min_range", "max_range"), _within, "outside min_range to max_range"
     ),
@@ -421,7 +419,10 @@ CONVENTIONS = (
 
 
 def conventions_of(kind: str, path: str, fields: Collection[str] | None = None) -> list[Convention]:
-    """Return what messages of this type say of the value at a path, by the `fields` they have."""
+    """Return the conventions for the value at a path in messages of this type.
+
+    With `fields`, only those whose marking fields are among the messages' `fields`.
+    """
     bare = re.sub(r"\[[^\]]*\]", "", path.partition(IN)[0])
     return [
         one
@@ -433,7 +434,7 @@ def conventions_of(kind: str, path: str, fields: Collection[str] | None = None) 
 
 
 def said_in(columns: Mapping[str, FieldColumn], path: str) -> F64:
-    """Return a field of each message (N,), or one element of its list; NaN if that is shorter."""
+    """Return a field of each message, or an element of a list, (N,); NaN if the list is shorter."""
     path, place = element_of(path)
     column = columns[path]
     if place is None:
@@ -450,7 +451,7 @@ _SEPARATORS = re.compile(r"[/.:]")
 
 
 def last_part(kind: str) -> str:
-    """Return a message type without package and namespace: "Twist" of `ros.geometry_msgs.Twist`."""
+    """Return a message type without its package: "Twist" for `ros.geometry_msgs.Twist`."""
     return _SEPARATORS.split(kind)[-1]
 
 
@@ -463,17 +464,17 @@ FIELDS = (
     *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
 )
 _FOXGLOVES = ("timestamp", "parent_frame_id", "child_frame_id", *AXES, *TURN)
-_LAYOUTS = (  # the same fields in as many types: ROS's, foxglove.FrameTransforms, FrameTransform
+_LAYOUTS = (  # the same fields in three types: ROS's, foxglove.FrameTransforms, FrameTransform
     FIELDS,
     tuple(f"transforms[].{path}" for path in _FOXGLOVES),
     _FOXGLOVES,
 )
 FRAME_ID = "header.frame_id"
-FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
+FRAME_IDS = (FRAME_ID, "frame_id")  # in ROS messages, and in Foxglove's
 
 
 def frame_path(source: Input, fields: Container[str]) -> str | None:
-    """Return the field with the frame of an input's point: its innermost header's."""
+    """Return the field with the frame of an input's point: that of the innermost header."""
     around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
     for count in range(len(around), -1, -1):
         path = ".".join([*around[:count], FRAME_ID])
@@ -483,12 +484,12 @@ def frame_path(source: Input, fields: Container[str]) -> str | None:
 
 
 def frame_id_path(fields: Container[str]) -> str | None:
-    """Return the field that says in which frame a message is."""
+    """Return the field that names a message's frame, or None."""
     return next((path for path in FRAME_IDS if path in fields), None)
 
 
 def transform_fields(fields: Collection[str]) -> tuple[str, ...] | None:
-    """Return the fields of transforms in the order of `FIELDS`; None if there are none."""
+    """Return the fields of transforms, in the order of `FIELDS`, or None if any is missing."""
     return next((layout for layout in _LAYOUTS if set(layout) <= set(fields)), None)
 
 

@@ -1,12 +1,12 @@
 """The tables of a profile: inputs, clock, episodes, frames, motion, zones, cameras, signals.
 
-An input says which topic fills it, which fields it needs, and what replaces it if it is missing.
+An input names its topic and the message fields it needs. `FALLBACKS` are what replaces it if it is
+missing.
 
 A custom signal is a value of any topic that becomes a column of the transitions:
-`[signals.battery_v]` of a profile names the column `battery_v` and says where it comes from. At
-every step it is the latest value of the topic (at or before the step, at most `max_age_s` old), or
-null. Conditions and queries see it as they see Restock's own signals; observation and reward do
-not.
+`[signals.battery_v]` of a profile defines the column `battery_v` and its source. At every step, it
+is the topic's latest value (at or before the step, at most `max_age_s` old), or null. Conditions
+and queries can use it like Restock's own signals; observation and reward do not contain it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Clock(Checked, frozen=True):
-    """The `[clock]` of a profile: what time is, and when the steps are."""
+    """The `[clock]` of a profile: the time of messages, and the times of the steps."""
 
     alignment: Literal["header.stamp", "log_time"] = "header.stamp"
     steps: Literal["rate", "command"] = "rate"
@@ -48,18 +48,18 @@ class Clock(Checked, frozen=True):
 
 
 class Episodes(Checked, frozen=True):
-    """The `[episodes]` of a profile: what ends one, beside goals, gaps and clock jumps."""
+    """The `[episodes]` of a profile: what ends episodes besides goals, gaps and clock jumps."""
 
-    # Larger: the robot was carried, or relocalised.
+    # After a larger jump the robot was carried, or relocalised, so the episode ends.
     max_pose_jump_m: Annotated[float, Meta(gt=0)] = 1.0
 
 
 class Frames(Checked, frozen=True):
-    """The `[frames]` of a profile: poses are of `base` in `fixed`."""
+    """The `[frames]` of a profile: take poses of `base` in `fixed` from transforms."""
 
     fixed: str = "map"
     base: str = "base_link"
-    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # age of a transform at the step, at most
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # largest age of a transform at the step
     topic: str = "/tf"
     static_topic: str = "/tf_static"
 
@@ -69,12 +69,12 @@ class Frames(Checked, frozen=True):
 
 
 class Motion(Checked, frozen=True):
-    """The `[motion]` of a profile: how its speeds are known where there is no odometry."""
+    """The `[motion]` of a profile: speeds from poses, for robots without odometry."""
 
     window_s: Annotated[float, Meta(gt=0, le=5)]  # length of the window of poses for a speed
 
 
-class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
+class Zone(Checked, frozen=True, omit_defaults=True):  # a default is left out of the profile's hash
     """A named rectangle of the map.
 
     `box_m = [x0, y0, x1, y1]` is turned about its middle by `yaw_rad`, counter-clockwise.
@@ -82,7 +82,8 @@ class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has wh
 
     name: str
     box_m: tuple[float, float, float, float]
-    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None  # defaults are known by identity
+    # None rather than 0, as msgspec recognises defaults by identity.
+    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
 
     def check(self) -> None:
         x0, y0, x1, y1 = self.box_m
@@ -90,7 +91,7 @@ class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has wh
             raise ValueError(f"box_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1: {self}")
 
     def holds(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points (N,) lie in it, its edges included."""
+        """Return which points (N,) lie in the zone or on its edge."""
         x0, y0, x1, y1 = self.box_m
         if self.yaw_rad:
             middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -104,13 +105,13 @@ class Camera(Checked, frozen=True):
     """One `[cameras.NAME]` of a profile: a topic of sensor_msgs Image or CompressedImage."""
 
     topic: str
-    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # age of the last frame at the step, at most
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # largest age of a frame at the step
     max_hz: Annotated[float, Meta(gt=0)] | None = None  # frames kept per second; None: all
     doc: str = ""
 
 
 def camera_name_problem(name: str) -> str | None:
-    """Say why a camera may not have this name; None if it may."""
+    """Return why a camera may not have this name, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name):
         return "a name consists of lower-case letters, digits and _, and begins with a letter"
     return None
@@ -119,7 +120,7 @@ def camera_name_problem(name: str) -> str | None:
 Reduce = Literal["min", "max", "mean", "sum", "count", "yaw"]
 NUMBER = pa.float64()
 LIST = pa.list_(pa.field("element", pa.float32()))
-# Columns that a store's views add to a transition's, and that labelling adds.
+# Names that custom signals may not have: columns of transitions, of a store's views, of labelling.
 _TAKEN = {
     *("logged_ns", "stamp_time", "logged_time", "pose_stamp_time", "tags", *NAMED, "row_"),
     *(column.name for column in COLUMNS),
@@ -137,11 +138,11 @@ class CustomSignal(Checked, frozen=True):
     max_age_s: Annotated[float, Meta(gt=0)] | None = (
         None  # None: latched, held until the next message
     )
-    reduce: Reduce | None = None  # how a list becomes one number, or a quaternion its yaw
-    values: dict[str, float] | None = None  # the number for each text, bool or number
+    reduce: Reduce | None = None  # how to make one number of a list, or of a quaternion ("yaw")
+    values: dict[str, float] | None = None  # maps texts, bools or numbers to numbers
     scale: float = 1.0  # stored value = value * scale + offset
     offset: float = 0.0
-    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # length of a vector
+    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # of a list; None: any length
     doc: str = ""
 
     def check(self) -> None:
@@ -172,7 +173,7 @@ class CustomSignal(Checked, frozen=True):
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """Return the fields to read of the message at the end of the path, if it is a message."""
+        """Return the fields to read if the path ends at a message: those of a quaternion."""
         return QUATERNION if self.reduce == "yaw" else ()
 
     @property
@@ -181,22 +182,22 @@ class CustomSignal(Checked, frozen=True):
 
     @property
     def picks(self) -> bool:
-        """Return whether it means one certain element, which a message may lack."""
+        """Return whether the path selects a single element, which a message may lack."""
         return any(s.choice is not None and not s.choice.many for s in self.read.steps)
 
     def wanted(self) -> list[str]:
-        """Return the field paths to read for it."""
+        """Return the field paths to decode."""
         return self.read.wanted(*self.ends)
 
     def field(self, name: str) -> pa.Field:
-        """Return its column, with unit and source in the metadata."""
+        """Return the signal's Arrow column, with unit and source in the metadata."""
         about = {"unit": self.unit, "topic": self.topic, "path": self.path, "meaning": self.doc}
         about |= {"length": str(self.length or "")}
         kind = LIST if self.is_list else NUMBER
         return pa.field(name, kind, nullable=True, metadata={k: v for k, v in about.items() if v})
 
     def problem(self, leaves: Sequence[Leaf]) -> str | None:
-        """Say why messages with these fields lack it; None if they have it."""
+        """Return why messages with these fields do not contain the signal, or None."""
         try:
             kinds = self.read.check(leaves, *self.ends)
         except PathProblem as problem:
@@ -207,7 +208,7 @@ class CustomSignal(Checked, frozen=True):
 
 
 def name_problem(name: str) -> str | None:
-    """Say why a custom signal may not have this name; None if it may."""
+    """Return why a custom signal may not have this name, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         return "a name consists of lower-case letters, digits and _"
     if name in _TAKEN:
@@ -220,10 +221,10 @@ def name_problem(name: str) -> str | None:
 def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str) -> None:
     """Check that a store's columns of custom signals have the types and units of this schema.
 
-    `have` are the fields of the store's table, as deltalake gives them.
+    `have` maps names to deltalake's fields of the store's table.
 
     Raises:
-        StoreError: one of the same name has another type or unit.
+        StoreError: a column of the same name has another type or unit.
     """
     for field in schema:
         unit = (field.metadata or {}).get(b"unit")
@@ -269,16 +270,16 @@ SCAN_OF_CLOUD = {
     "angle_increment_rad": "angle_increment",
 }
 _Bearing = Annotated[float, Meta(ge=-3.1416, le=3.1416)]
-_OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of its outline
-SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
+_OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of the outline
+SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # inputs of up to four lidars
 
 
 class Form(NamedTuple):
-    """The fields by which messages may fill an input."""
+    """The fields of messages that fill an input."""
 
     needs: tuple[str, ...] = ()
-    either: tuple[str, ...] = ()  # and one of these two
-    may: tuple[str, ...] = ()
+    either: tuple[str, ...] = ()  # exactly one of these two is required, too
+    may: tuple[str, ...] = ()  # optional
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -286,14 +287,14 @@ class Form(NamedTuple):
 
 
 _TURNS = ("yaw_rate_radps", "steering_rad")
-_HEADING = ("orientation", "yaw_rad")  # the path of a quaternion, which becomes a yaw, or a yaw
+_HEADING = ("orientation", "yaw_rad")  # a quaternion, which is converted to a yaw, or a yaw
 _TEXT = Form(("text",))
 BY_FIX = Form(("latitude_deg", "longitude_deg"), may=("status", "covariance_m2", "covariance_type"))
 BY_RATES = Form(("speed_mps", "yaw_rate_radps"), may=("sideways_mps",))
 INPUT_FIELDS: dict[str, Form] = {
     "command": Form(("speed_mps",), _TURNS, ("sideways_mps",)),
     "pose": Form(("x_m", "y_m"), _HEADING),  # or BY_FIX, or BY_RATES
-    "heading": Form(either=_HEADING),  # of a pose by fix
+    "heading": Form(either=_HEADING),  # only for a pose by fix
     "wheels": Form(("speed_mps", "yaw_rate_radps")),
     "imu": Form(("yaw_rate_radps", "accel_x_mps2")),
     **dict.fromkeys(
@@ -308,10 +309,10 @@ INPUT_FIELDS: dict[str, Form] = {
     "true_exposure": _TEXT,
     "perturbation": _TEXT,
 }
-# Of a source of commands: the commands that it gives, or what is pressed while it drives.
+# Fields of a source of commands: its commands, or a button that is pressed while it drives.
 COMMAND_SOURCE_FIELDS = ("speed_mps", *_TURNS, "pressed")
 
-# What is used instead of an input that is left out, or is optional and the recording lacks.
+# What replaces an input that the profile leaves out, or an optional one that a recording lacks.
 FALLBACKS: dict[str, str] = {
     "scan": "no lidar: clearance is unknown (null), and the observation has no sectors",
     "imu": "gyro yaw rate taken from the wheels, acceleration 0",
@@ -322,7 +323,7 @@ FALLBACKS: dict[str, str] = {
     "true_exposure": "unknown: exposures are not scored",
     "perturbation": "unknown: null, as for hardware",
 }
-MOTION = "Odometry"  # the last part of its types: what was measured, where commands are of others
+MOTION = "Odometry"  # last part of message types that contain measured motion, not commands
 STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POLICY_FALLBACK = "the source whose command it equals: {names}; else the profile's behaviour_policy"
@@ -348,42 +349,42 @@ _APPLIES_TO = {
 
 
 def is_motion(kind: str) -> bool:
-    """Return whether messages of this type hold measurements and no commands."""
+    """Return whether messages of this type contain measured motion, not commands."""
     return last_part(kind) == MOTION
 
 
 class Input(Checked, frozen=True):
-    """One topic, and which of its fields fill what."""
+    """One `[inputs.NAME]` of a profile: a topic, and the paths of the fields that it needs."""
 
     topic: str
     type: str
-    fields: dict[str, str]
-    # Largest age; None: latched until the next message.
+    fields: dict[str, str]  # name in `INPUT_FIELDS` -> path in the message
+    # Largest age at the step; None: latched until the next message.
     max_age_s: Annotated[float, Meta(gt=0)] | None = None
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
-    stop_holds: bool = False  # a command to stop holds until the next one
-    # Of a lidar: whether its scans turn clockwise, as seen from above; where it is, from the middle
-    # of the outline (ahead, left), if not where [task.body] has it; and the angle of its zero.
+    stop_holds: bool = False  # a command to stop holds until the next command, whatever its age
+    # For a lidar: whether scans run clockwise, seen from above; its position (ahead, left) from the
+    # middle of the outline, if not that of [task.body]; and the yaw of its zero angle.
     upside_down: bool = False
     lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
     lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
-    # Of a point cloud, in its own frame: what is read as a scan (`restock.ingest.steps.clouds`).
+    # For a point cloud: the slice, in its frame, read as a scan (`restock.ingest.steps.clouds`).
     height_m: tuple[float, float] | None = None  # the lowest and highest point
     angle_rad: tuple[_Bearing, _Bearing] | None = None  # the first and last bearing; None: all
-    # Of a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
+    # For a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
-    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
+    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # fixes above are not used; None: 5
     track_m: Annotated[float, Meta(gt=0)] | None = None  # distance that gives the yaw; None: 1
 
     @property
     def by_fix(self) -> bool:
-        """Return whether it is a position by latitude and longitude."""
+        """Return whether the input is a position by latitude and longitude."""
         return "latitude_deg" in self.fields
 
     @property
     def by_rates(self) -> bool:
-        """Return whether it has speeds; a pose that has is by dead reckoning."""
+        """Return whether the input has speeds, which makes a pose one by dead reckoning."""
         return not {*BY_RATES.needs, *BY_RATES.may}.isdisjoint(self.fields)
 
 
@@ -395,14 +396,14 @@ class Inputs(Checked, frozen=True):
     pose: Input | None = None
     heading: Input | None = None  # for fixes; None: the direction of driving
     scan: Input | None = None
-    scan_2: Input | None = None  # further lidars: what is nearest to any of them counts
+    scan_2: Input | None = None  # further lidars; the nearest return of any of them counts
     scan_3: Input | None = None
     scan_4: Input | None = None
     imu: Input | None = None
     goal: Input | None = None
     plan: Input | None = None
     bumper: Input | None = None
-    nav_command: Input | None = None  # the navigation stack's proposal, before the choice
+    nav_command: Input | None = None  # the navigation stack's proposed command
     behaviour_policy: Input | None = None
     true_condition: Input | None = None
     true_exposure: Input | None = None
@@ -421,10 +422,10 @@ class Inputs(Checked, frozen=True):
 
 
 def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
-    """Check that an input has the fields it needs; `framed` if transforms can give its pose.
+    """Check an input's fields and settings; `framed` if the profile has [frames] to give the pose.
 
     Raises:
-        ConfigError: it does not; names the key.
+        ConfigError: a field or setting is missing or does not apply; names the key.
     """
     form = INPUT_FIELDS[name]
     if name == "pose" and (source.by_fix or source.by_rates):
@@ -456,7 +457,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
 
 
 def _check_settings(key: str, name: str, source: Input, where: str) -> None:
-    """Refuse settings that do not apply to an input of this name; "": to a source of commands."""
+    """Refuse settings that do not apply to an input; `name` is "" for a source of commands."""
     own = {"command": _COMMAND, **dict.fromkeys(SCANS, _SCAN)}.get(name)
     for setting, only in _APPLIES_TO.items():
         applies = only == own or (only == _FIX and source.by_fix)
@@ -467,10 +468,10 @@ def _check_settings(key: str, name: str, source: Input, where: str) -> None:
 
 
 def check_scans(scans: Mapping[str, Input], where: str) -> None:
-    """Check that the settings of several lidars go together.
+    """Check that the settings of all lidars are consistent.
 
     Raises:
-        ConfigError: they do not; names the key.
+        ConfigError: they are not; names the key.
     """
     for name, source in scans.items():
         if source.lidar_yaw_rad is not None and source.lidar_at_m is None:
@@ -511,7 +512,7 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
 
 
 def _check_cloud(key: str, source: Input, where: str) -> None:
-    """Check what makes a scan of a point cloud."""
+    """Check the settings that turn a point cloud into a scan."""
     if source.type != CLOUD:
         for setting in ("height_m", "angle_rad"):
             if getattr(source, setting) is not None:
@@ -566,7 +567,7 @@ def _check_wheelbase(key: str, source: Input, where: str) -> None:
 
 
 def check_command_source(key: str, source: Input, command: Input, where: str) -> None:
-    """Check that a source has the command's fields, or says what is pressed while it drives.
+    """Check that a source of commands has the command's fields, or a button that shows it drives.
 
     Raises:
         ConfigError: it does not; names the key.

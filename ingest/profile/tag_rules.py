@@ -1,10 +1,10 @@
 """Tags of a recording: robot, site and others, and where they come from.
 
-A tag is text by name, one of each per recording. `robot`, `site`, `firmware`, `map` and `shift` are
-columns of the views; all, with any other names, are in their column `tags`.
+A tag is a name with a text value; a recording has one value per name. In the views, `robot`,
+`site`, `firmware`, `map` and `shift` are columns, and all tags are in the column `tags`.
 
-They come from the command line, the recording itself and its path. The command line overrides the
-others. The recording's own metadata and its path must not contradict each other.
+Tags come from the command line, the recording's metadata and its path. The command line overrides
+the others. Metadata and path must not contradict each other.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from restock.errors import ConfigError, RecordingError
 from restock.toml import Checked
 
 NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
-MAX_TAGS = 64  # of a recording
+MAX_TAGS = 64  # per recording
 MAX_NAME, MAX_VALUE = 64, 256  # characters
 
 
@@ -32,11 +32,10 @@ def parse_tags(texts: Iterable[str], *, empty: bool = False) -> dict[str, str]:
 
     Args:
         texts: such as `robot=amr-07`.
-        empty: whether a value may be empty (`KEY=`): it then takes the tag off.
+        empty: whether a value may be empty (`KEY=`), which removes the tag.
 
     Raises:
-        ConfigError: a text of another form, a name or value that is too long, or a name with two
-            values.
+        ConfigError: a text has another form, a name or value is too long, or a name has two values.
     """
     tags: dict[str, str] = {}
     for text in texts:
@@ -63,7 +62,7 @@ def parse_tags(texts: Iterable[str], *, empty: bool = False) -> dict[str, str]:
 
 
 def tag_problem(name: str, value: str) -> str | None:
-    """Return why this cannot be a tag, or None."""
+    """Return why a tag may not have this name and value, or None."""
     if not 0 < len(name) <= MAX_NAME or "=" in name or not name.isprintable():
         return (
             f"{name[: MAX_NAME + 1]!r} is not a name of a tag: use 1 to {MAX_NAME} "
@@ -77,22 +76,23 @@ def tag_problem(name: str, value: str) -> str | None:
 
 
 def in_words(tags: Mapping[str, str]) -> str:
-    """Return tags on one line, the named ones first."""
+    """Format tags as one line, those in NAMED first."""
     names = [*(name for name in NAMED if name in tags), *sorted(tags.keys() - set(NAMED))]
     return ", ".join(f"{name}={tags[name]}" for name in names)
 
 
-Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"  # source, record, entries: of a recording
+# Metadata of a recording: the source's name for messages, the record's name, and its entries.
+Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"
 _TABLE = "`[tags]` of the profile"
 
 
 class TagRules(Checked, frozen=True):
-    """The `[tags]` of a profile: what of a path, and of a recording's metadata, is a tag.
+    """The `[tags]` of a profile: how to read tags from a recording's path and metadata.
 
-    `from_path` is a pattern of the path's last parts, or several, of which the first that matches
-    counts: `{robot}` is a tag, `*` anything within a part, `?` one character, `**` any number of
-    parts. `from_metadata` says which entry of the recording's metadata is a tag of another name:
-    `robot = "vehicle_id"`, or `"record.vehicle_id"` if several records have one.
+    `from_path` is a pattern for the last parts of the path, or several, of which the first match
+    counts. `{robot}` matches the value of a tag, `*` anything within a part, `?` one character and
+    `**` any number of parts. `from_metadata` maps a tag to an entry of the recording's metadata:
+    `robot = "vehicle_id"`, or `"record.vehicle_id"` if several records have that entry.
     """
 
     from_path: str | list[str] = msgspec.field(default_factory=list)
@@ -110,10 +110,10 @@ class TagRules(Checked, frozen=True):
         return [self.from_path] if isinstance(self.from_path, str) else self.from_path
 
     def of_path(self, path: Path, given: Collection[str]) -> dict[str, dict[str, str]]:
-        """Return the tags of a path, by the pattern that gives them; empty without a pattern.
+        """Return the tags of a path, keyed by their source; empty without a pattern.
 
         Raises:
-            RecordingError: no pattern matches, and `given` leaves open what they would say.
+            RecordingError: no pattern matches, and `given` lacks some tag of the patterns.
         """
         place = Path(os.path.abspath(path)).as_posix()  # noqa: PTH100  (".." out, links kept)
         for pattern in self.patterns:
@@ -137,10 +137,10 @@ class TagRules(Checked, frozen=True):
     def of_metadata(
         self, said: Sequence[Said], given: Collection[str], where: str
     ) -> tuple[dict[str, dict[str, str]], list[str]]:
-        """Return the tags in a recording's metadata, by their source, and notes on the rest.
+        """Return the tags in a recording's metadata, keyed by their source, and notes.
 
         Raises:
-            RecordingError: it contradicts itself about a tag that is not `given`.
+            RecordingError: the metadata has two values of a tag that is not `given`.
         """
         found: dict[str, list[tuple[str, str, str]]] = {}  # value, source, record
         for source, record, entries in said:
@@ -155,7 +155,7 @@ class TagRules(Checked, frozen=True):
         for name in dict.fromkeys([*named, *found]):
             value, source, _ = found[name][0]
             other = next((entry for entry in found[name] if entry[0] != value), None)
-            # Of a name that is only text to us, two records may mean two things.
+            # Two records may use a name that no rule mentions for different things.
             same = name in named or not any(record for _, _, record in found[name])
             if other and same:
                 raise _contradiction(name, (value, source), other[:2], where)
@@ -174,7 +174,7 @@ class TagRules(Checked, frozen=True):
         ]
 
     def _names(self, record: str, key: str) -> list[str]:
-        """Return the tags that an entry of the metadata gives."""
+        """Return the names of the tags that take their value from an entry of the metadata."""
         wanted = (key, f"{record}.{key}")
         requested = [name for name, source in self.from_metadata.items() if source in wanted]
         return requested or [key] * (key not in self.from_metadata)
@@ -182,7 +182,7 @@ class TagRules(Checked, frozen=True):
 
 @dataclass
 class RecordingTags:
-    """Tags of a recording, and what there is to say of them."""
+    """Tags of a recording, and notes for the user."""
 
     tags: dict[str, str]
     notes: list[str] = field(default_factory=list)
@@ -195,14 +195,14 @@ def resolve_tags(
     given: Mapping[str, str],
     before: Mapping[str, str],
 ) -> RecordingTags:
-    """Return the tags of one recording.
+    """Determine the tags of one recording.
 
     Args:
-        rules: of its profile.
-        path: where it lies.
-        said: its own metadata.
-        given: what the command line says: it decides, and an empty value takes a tag off.
-        before: its tags in the store: those that nothing speaks of any more stay.
+        rules: the rules of its profile.
+        path: its path.
+        said: its metadata.
+        given: tags from the command line, which override all others; an empty value removes a tag.
+        before: its tags in the store; a tag that no source mentions any more is kept.
 
     Raises:
         RecordingError: two sources disagree, or no pattern matches the path, and `given` does not
@@ -238,10 +238,10 @@ _TAG = r"\{[A-Za-z_]\w*\}"
 
 @cache
 def path_pattern(pattern: str) -> re.Pattern[str]:
-    """Compile a `from_path` into a regular expression of absolute paths.
+    """Compile a `from_path` into a regular expression for absolute paths.
 
     Raises:
-        ValueError: the pattern cannot be read; says why.
+        ValueError: the pattern is invalid; says why.
     """
     parts = pattern.removeprefix("/").split("/")
     if not pattern.startswith("/") and "**" in parts and not re.match(r"[^{*?]", pattern):
@@ -262,7 +262,7 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def _of_part(part: str) -> str:
-    """Return the regular expression of one part of a path, which is not empty."""
+    """Return the regular expression for one part of a path; it matches no empty part."""
     wild = {"*": "[^/]*", "?": "[^/]"}
     pieces = (
         f"(?P<{piece[1:-1]}>[^/]+?)" if piece[:1] == "{" else wild.get(piece, re.escape(piece))

@@ -31,9 +31,7 @@ NOWHERE = f"{NO_MISSION}, nowhere far enough"
 
 _SHORTEST = 3.0  # shortest distance from start to goal, in goal radii
 _WAIT_S = 10.0  # longest standing before the start that belongs to the mission
-_BACK = (
-    0.6  # the robot has turned back if its distance from the start is below this share of the max
-)
+_BACK = 0.6  # share of the farthest distance from the start below which the robot turned back
 _LIMIT = 0.9  # longest mission, as a share of the task's time limit
 
 GoalSource = Literal["logged", "hindsight"]
