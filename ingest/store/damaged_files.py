@@ -237,8 +237,11 @@ def is_damaged(place: Location, path: str) -> bool:
 def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
     """Return the files that a damaged file was joined from, reduced to the ingests to restore.
 
-    The list is empty if one of them is gone or damaged, or if they lack some of the file's rows.
+    The list is empty if one of them is gone or damaged, or if they lack some of the file's rows. It
+    is empty for a file of one ingest: the files that its commit removed had what it replaced.
     """
+    if OWN_PATH.fullmatch(path):
+        return []
     paths = _find_joined_files(place, name, path)
     if any(is_damaged(place, one) for one in _in_table(name, paths)):
         return []

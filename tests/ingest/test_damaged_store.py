@@ -104,6 +104,18 @@ def test_what_a_damaged_file_loses_is_named_and_ingested_again(place, name, how)
     assert shown(place) == expected((1, "c", 0), (2, "b", 7), (3, "c", 0), (4, "a", 0))
 
 
+def test_rows_of_a_replaced_ingest_are_not_restored(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    writer.write(*one(1, "b"))  # with as many rows
+    (file,) = active(tmp_path / "s", TRANSITIONS)
+    damage(tmp_path / "s", file, "cut")
+    done = drop_damaged(writer)
+    assert (done.joined_again, done.dropped) == ([], [file])
+    assert [one.recording_id for one in done.lost] == [f"{1:016x}"]
+    assert shown(tmp_path / "s") == {}
+
+
 @pytest.mark.parametrize("how", ["cut", "missing"])
 def test_a_damaged_manifest_is_named_and_dropped(writer, tmp_path, how):
     file = f"{RECORDINGS}/{1:016x}/{1:016x}-a.parquet"
