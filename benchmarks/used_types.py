@@ -380,7 +380,7 @@ USED: tuple[Fault, ...] = (
             zero_for_nothing(s)) for s in (0.02, 0.1, 1.0)),
     # commands
     *(Fault("proposals stored as commands", f"in {s:.0%} of missions",
-            says("action|command|drive as another", rf"{UNLIKE}|follows? from|does not follow"
+            says("action|command|driven like another", rf"{UNLIKE}|follows? from|does not follow"
                  r"|other rows|another policy|propos|navigation|not executed|_MIXED"),
             routed=proposals(s)) for s in (0.1, 0.3, 1.0)),
     *(Fault("actions of the next state", f"in {s:.0%} of missions",

@@ -285,15 +285,15 @@ OF_ONE: dict[str | None, tuple[Plant, str]] = {
     None: (lambda rows: rows, ""),
     "wheels": (lambda rows: _added(rows, "wheel_speed", "wheel_speed", -0.08),
                "the scale of the logs' wheels (speed) is 0.92"),
-    "short": (lambda rows: _lidar(rows, lambda seen: seen - 0.25), "lidar measures -0.2"),
+    "short": (lambda rows: _lidar(rows, lambda seen: seen - 0.25), "lidar differ by -0.2"),
     "blind": (lambda rows: _lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
               "racks and walls in 25% of its sectors (degrees from ahead: -175,"),
     "elsewhere": (lambda r: replace(r, pose=r.pose + np.outer(r.episode % 2, [1, 1, 0])),
-                  "lidar does not see the racks where the pose has them"),
+                  "lidar does not see the racks that should be near the pose"),
     "drivers": (lambda rows: replace(rows, driver=_drivers(rows, "operator", "planner")),
-                "drive as another policy"),
+                "driven like another policy"),
     "lost": (lambda rows: replace(rows, counted=np.add(rows.counted, [40, 0])),
-             "of the rows that were written of these recordings are gone"),
+             "of the rows that ingest wrote for these recordings are gone"),
 }  # fmt: skip
 
 

@@ -1,8 +1,8 @@
-"""Test whether the logs' sensors and actions answer to each other as the twin's do.
+"""Test whether sensors and actions in the logs respond to each other as in the twin.
 
-For each relation: the gain, the delay and the unexplained part, in the logs against the twin; or
-against the definition if no twin can be driven. And for each action: the motion that it
-comes to when held: which of the twin's actions is that?
+Each relation has a gain, a delay and an unexplained part. The logs' figures are compared with the
+twin's, or with the definition if no twin can be driven. Each action has a motion that the robot
+settles to while the action is held. That motion is compared with those of the twin's actions.
 """
 
 from __future__ import annotations
@@ -20,31 +20,34 @@ from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, 
 from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run, shares_compared
 
 RESAMPLES = 200
-_ANSWERS = 0.4  # of what should follow; less is none
-_SURELY = 10.0  # times the noise: what moves in a mission, for its answer to be known
+_ANSWERS = 0.4  # share of the expected response; a mission with less does not respond
+_SURELY = 10.0  # expected motion over noise from which a mission's response can be judged
 MIN_CLUSTERS = 5
-_RIDGE = 1e-4  # of the mean diagonal: lags that the rows do not tell apart
+_RIDGE = 1e-4  # of the mean diagonal; for lags that the rows cannot tell apart
 
 
 @dataclass(frozen=True)
 class Response:
-    """A fitted response, with its R bootstrap draws."""
+    """A fitted response of y to x at L lags, with R bootstrap draws over C clusters."""
 
     rows: int
     clusters: int
     gain: float
     delay: float  # steps
-    unexplained: float  # of y's mean square
+    unexplained: float  # share of y's mean square
     gains: F64  # (R,)
     delays: F64  # (R,)
     unexplained_draws: F64  # (R,)
-    offset: float  # of y where x is 0
+    offset: float  # y when x is 0
     offsets: F64  # (R,)
     kernel: F64  # (L,)
-    moments: F64  # (C, L + 1, L + 1) of each cluster, of x and y
+    moments: F64  # (C, L + 1, L + 1) sums of products of x at each lag and y, per cluster
 
     def strayed(self, kernel: F64) -> tuple[int, int]:
-        """Count the clusters that surely do not answer by `kernel`, of those that move enough."""
+        """Count the clusters that do not respond as `kernel` predicts, and those that were judged.
+
+        A cluster is judged if it moves enough. Both counts are 0 below `MIN_CLUSTERS` of these.
+        """
         xx, xy = self.moments[:, :-1, :-1], self.moments[:, :-1, -1]
         moved = np.einsum("i,cij,j->c", kernel, xx, kernel)
         gain = (xy @ kernel) / np.maximum(moved, 1e-12)
@@ -57,9 +60,10 @@ class Response:
 def fit_response(
     x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator, *, centred: bool = False
 ) -> Response | None:
-    """Fit the response of y (n,) to x (n, L) at `lags` (L,); None if too little is known.
+    """Fit the response of y (n,) to x (n, L) at `lags` (L,); None if the rows are too few.
 
-    Rows with a value that is not finite are left out. `centred`: to x and a constant.
+    None also if x or y is always 0. Rows with NaN or infinite values are ignored. `centred` fits
+    an intercept, too.
     """
     known = np.isfinite(y) & np.isfinite(x).all(axis=1)
     x, y = x[known], y[known]
@@ -87,7 +91,7 @@ def fit_response(
         drawn = drawn - rows[..., None] * mean[:, :, None] * mean[:, None, :]
     xx, xy, yy = drawn[:, :-1, :-1], drawn[:, :-1, -1], drawn[:, -1, -1]
     ridge = _RIDGE * np.trace(xx, axis1=1, axis2=2) / (width - 1)
-    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters without a change
+    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters with constant x
     h = np.linalg.solve(xx + ridge[:, None, None] * np.eye(width - 1), xy[..., None])[..., 0]
     gain = h.sum(axis=1)
     safe = np.where(np.abs(gain) > 1e-9, gain, 1e-9)
@@ -103,9 +107,9 @@ def fit_response(
 
 
 def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
-    """Return the interval of a ratio of statistics with independent draws (R,) and values `at`.
+    """Return the interval of a ratio of two statistics with independent draws (R,), values `at`.
 
-    `clusters` are those of the one that has fewer.
+    `clusters` is the smaller of their two numbers of clusters.
     """
     bottom = np.where(np.abs(below) > 1e-9, below, np.nan)
     return interval_of(at[0] / at[1] if at[1] else float("nan"), above / bottom, clusters)
@@ -114,15 +118,12 @@ def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> 
 def difference_of(
     first: F64, second: F64, at: tuple[float, float], clusters: int
 ) -> ConfidenceInterval:
-    """Return the interval of a difference, with independent draws (R,) and values `at`.
-
-    `clusters` are those of the one that has fewer.
-    """
+    """Return the interval of a difference of two statistics, as `ratio_of` does of a ratio."""
     return interval_of(at[0] - at[1], first - second, clusters)
 
 
 def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> ConfidenceInterval:
-    """Return the interval of a statistic with draws (R,) over clusters; NaN if not known."""
+    """Return the interval of a statistic with draws (R,); bounds are NaN if none is finite."""
     finite = draws[np.isfinite(draws)]
     if not len(finite) or not np.isfinite(value):
         return ConfidenceInterval(value, float("nan"), float("nan"))
@@ -130,35 +131,35 @@ def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> Conf
 
 
 def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
-    """Return x (N,) at each of L lags, (N, L); NaN if the row of that lag is unknown."""
+    """Return x (N,) at each of L lags, (N, L); NaN if there is no row at that lag."""
     return np.stack([np.where(known, x[row], np.nan) for row, known in before], axis=1)
 
 
 ACTION_SPEED, ACTION_TURN = "action (speed)", "action (turn)"
 WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
 POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
-COMMANDS = np.arange(-4, 8)  # lags of commands: robots answer late, logs may be wrong either way
+COMMANDS = np.arange(-4, 8)  # lags: robots respond late, and logs may be wrong either way
 SENSORS = np.arange(-3, 4)
 PLANS = np.arange(-3, 7)
 NOW = np.zeros(1, np.int64)
-_JUMP_RAD = 0.8  # a plan was replaced, not turned
-_SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
-_JUMP_M = 0.6
-_AHEAD = 0.5  # sine of the waypoint's bearing, at most, for the way to be what is driven
-_MOST = 0.5  # of what moves
-_CLEAN = 0.1  # of what moves in a recording, in episodes without slip, for slip to be the floor's
-_MIN_EPISODES = 5  # of a recording that is judged by itself
+_JUMP_RAD, _JUMP_M = 0.8, 0.6  # larger changes in one step mean that the plan was replaced
+_SLOW_MPS = 0.3  # below it a waypoint's bearing changes by turning, not by driving past it
+_AHEAD = 0.5  # largest sine of the waypoint's bearing at which driving shortens the route
+_MOST = 0.5  # least share of the motion that must remain without the rows near slip
+_CLEAN = 0.1  # least share of a recording's motion without slip, to put slip down to the floor
+_MIN_EPISODES = 5  # recordings with fewer are judged together
 _NEAR_STEPS = 5
-_FAR = 0.97  # of the lidar's range: nothing was seen
+_FAR = 0.97  # lidar entries beyond this saw nothing
 SlipLeftOut = Literal["episodes", "rows", "none"]
-GAIN = 1.2  # of logs over the twin's, or its inverse: robots answer differently
-ALIKE = 1.05  # of two sensors that measure one motion
-BIAS_RADPS, TURN_RADPS = 0.02, 0.06  # of a turn by one sensor where another, or an action, has none
+GAIN = 1.2  # largest gain of the logs over the twin's, or its inverse: robots differ
+ALIKE = 1.05  # the same for two sensors that measure one motion
+BIAS_RADPS = 0.02  # largest turn that one sensor may show while another shows none
+TURN_RADPS = 0.06  # and while the action has none
 BIAS_MPS2 = 0.2
-SIDEWAYS = 0.06  # of the way forward, about 3 degrees
-ARM_M = 0.06  # from where the robot turns to where its pose is
-STRAYED = 0.05  # of the missions
-_STRAIGHT_RADPS = 0.15
+SIDEWAYS = 0.06  # largest sideways over forward motion, about 3 degrees
+ARM_M = 0.06  # largest distance from the point that the robot turns about to that of its pose
+STRAYED = 0.05  # largest share of missions without response, beyond the twin's
+_STRAIGHT_RADPS = 0.15  # slower turns count as driving straight
 
 
 @dataclass(frozen=True)
@@ -169,17 +170,17 @@ class Relation:
     x: str
     y: str
     lags: Ints
-    of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
-    defined: bool = True  # x is y, so that the gain is 1 where there is no twin to ask
-    zero: str = ""  # instead of a gain, a figure of this name, which is 0 in the twin too
-    most: float = GAIN  # times the twin's gain, or its inverse
-    offset: float = math.inf  # most of y where x is 0, less the twin's, in y's unit
+    of: Callable[[FedRows], tuple[F64, F64]]  # returns x and y of the rows, (N,) or (N, S) each
+    defined: bool = True  # x and y are one quantity: without a twin, the expected gain is 1
+    zero: str = ""  # name of a figure that replaces the gain and is 0 in the twin
+    most: float = GAIN  # largest gain over the twin's, or its inverse; for `zero`, of the figure
+    offset: float = math.inf  # largest y when x is 0, less the twin's, in y's unit
     unit: str = "m/s"  # of y
 
     def fit(
         self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
     ) -> Response | None:
-        """Fit the response; None if the rows say too little."""
+        """Fit the response of y to x; None if the rows are too few or nothing moves."""
         x, y = self.of(rows)
         y = y.copy()
         y[_left_out(rows, _motion(x, y), leave_out)] = np.nan
@@ -194,9 +195,9 @@ class Relation:
     def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
         """Return which logged rows to leave out, so that the robot is not blamed for a wet floor.
 
-        Where wheels slip, the floor decides how a robot moves, also in the rows around those
-        labelled: so whole episodes are left out, as long as others remain. But a wrong sensor looks
-        like slip too, all the time: then nearly every episode of its recording is so labelled.
+        If wheels slip, the floor decides how a robot moves, also in the rows around the labelled
+        ones. So whole episodes are left out as long as others remain. But a wrong sensor looks like
+        slip, too, all the time: then nearly every episode of its recording has the label.
         """
         moves = _motion(*self.of(rows))
         if _on_ice(rows, moves).any():
@@ -217,9 +218,9 @@ def _left_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
 
 
 def _slips(rows: FedRows) -> Bools:
-    """Return which rows (N,) are labelled so, if they mostly move less or more than the wheels.
+    """Return which rows (N,) slip: labelled rows of episodes that mostly do not move as the wheels.
 
-    Who moves as far, but not where the pose heads, does not slip.
+    A robot that moves as far as its wheels turn, but not where its pose heads, does not slip.
     """
     labelled = rows.condition == "wheel_slip"
     moved = np.hypot(rows.after("localised_speed"), rows.after("lateral_speed"))
@@ -230,7 +231,7 @@ def _slips(rows: FedRows) -> Bools:
 
 
 def _near_slip(rows: FedRows) -> Bools:
-    """Return which rows (N,) are labelled as slipping or within a few steps of one."""
+    """Return which rows (N,) slip or are within `_NEAR_STEPS` of a row that does."""
     slips = _slips(rows)
     near = slips.copy()
     for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
@@ -240,9 +241,9 @@ def _near_slip(rows: FedRows) -> Bools:
 
 
 def _on_ice(rows: FedRows, moves: F64) -> Bools:
-    """Return the rows (N,) of episodes with slip, in recordings that also move without slip.
+    """Return which rows (N,) are of episodes with slip, in recordings that also move without it.
 
-    Recordings of few episodes are judged together.
+    `moves` (N,) is the motion of each row.
     """
     if not len(rows):
         return np.zeros(0, np.bool_)
@@ -261,7 +262,7 @@ def wheel_turn(rows: FedRows) -> F64:
 
 
 def _pose_turn(rows: FedRows) -> F64:
-    """Return the yaw rate (rad/s) of the pose's heading to the row after; NaN if unknown."""
+    """Return the yaw rate (rad/s) of the pose's heading until the next row; NaN if unknown."""
     if rows.pose is None:
         return np.full(len(rows), np.nan)
     after, known = rows.before(-1)
@@ -270,28 +271,28 @@ def _pose_turn(rows: FedRows) -> F64:
 
 
 def _sideways(rows: FedRows) -> tuple[F64, F64]:
-    """Return the pose's speed forward and sideways, of rows that drive straight on."""
+    """Return the pose's speeds forward and sideways (m/s); sideways is NaN in turns."""
     forward, aside = rows.after("localised_speed"), rows.after("lateral_speed")
     straight = np.abs(rows.after("gyro_yaw_rate")) < _STRAIGHT_RADPS
     return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: there was no new pose
 
 
 def _swinging(rows: FedRows) -> tuple[F64, F64]:
-    """Return the yaw rate, and the pose's speed sideways."""
+    """Return the yaw rate (rad/s) and the pose's speed sideways (m/s; NaN without a new pose)."""
     aside = rows.after("lateral_speed")
     return rows.after("gyro_yaw_rate"), np.where(aside != 0.0, aside, np.nan)
 
 
 def _gained(rows: FedRows) -> F64:
-    """Return the acceleration of the wheels over the step, m/s2."""
+    """Return the acceleration of the wheels over the step (m/s2)."""
     change = rows.after("wheel_speed") - rows.now("wheel_speed")
     return np.asarray(change / rows.task.control_period_s)
 
 
 def _turned_waypoint(rows: FedRows) -> F64:
-    """Return the yaw rate (rad/s) that the near waypoint's bearing shows.
+    """Return the yaw rate (rad/s) that explains the change of the near waypoint's bearing.
 
-    NaN where driving or the plan moved it.
+    NaN if the robot drove or the plan was replaced, which move the waypoint, too.
     """
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
@@ -302,10 +303,10 @@ def _turned_waypoint(rows: FedRows) -> F64:
 
 
 def _route_speed(rows: FedRows) -> F64:
-    """Return how fast the way to go became shorter, m/s.
+    """Return how fast the remaining distance shrinks (m/s).
 
-    NaN if the plan jumped or is at its maximum, or if the robot does not head along it: who
-    drives elsewhere does not shorten it.
+    NaN if the plan was replaced, if the distance is at its maximum, or if the robot does not head
+    along the route, as driving elsewhere does not shorten it.
     """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
     shorter = 10.0 * (now - after)
@@ -315,7 +316,10 @@ def _route_speed(rows: FedRows) -> F64:
 
 
 def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
-    """Return how sectors (N, S) would change by a turn on the spot (rad/s), and how they did."""
+    """Return how lidar sectors (N, S) would change by `turn` (rad/s) on the spot, and how they did.
+
+    The actual change is NaN if nothing was seen, at edges, and in slow turns.
+    """
     now, after = rows.sectors(), rows.sectors(after=True)
     width = 2 * np.pi / max(rows.task.sectors, 1)
     slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
@@ -366,40 +370,40 @@ RELATIONS = (
 )  # fmt: skip
 
 
-NOISY_GAIN = 2.0  # of relations that are no measurement of the same thing
+NOISY_GAIN = 2.0  # `GAIN` for relations whose x and y are not one quantity
 DELAY_STEPS = 0.6
-LATEST_STEPS = 2.0  # without a twin: how late a robot may answer to its commands
-UNEXPLAINED = 0.2
-_LEFT = 0.5  # most of two measurements of the same thing, with a twin or without
-NOISY_UNEXPLAINED = 0.4  # where it depends on who drives, and where
-_KNOWN_GAIN = 0.3  # of logs over the twin's, for a delay to mean something
-HELD = 3  # steps of one action in a row, for its motion to be that action's
-_MIN_HELD = 15
+LATEST_STEPS = 2.0  # without a twin: how late a robot may respond to its commands
+UNEXPLAINED = 0.2  # largest unexplained share, less the twin's
+_LEFT = 0.5  # largest unexplained share if x and y are one quantity, with a twin or without
+NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` if x and y are not one quantity: driver and place matter
+_KNOWN_GAIN = 0.3  # a delay means nothing if the gain over the twin's is smaller
+HELD = 3  # consecutive steps of one action after which the motion counts as that action's
+_MIN_HELD = 15  # rows
 _AWAY = 0.25  # of the fastest action on each axis
-_MAX_ROWS = 0.8  # of an action's, those with the motion of one other
-TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and what it leaves out
+_MAX_ROWS = 0.8  # least share of an action's rows that must move as one other action
+TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and rows left out
 
 
 @dataclass(frozen=True)
 class Broken:
     """The stretches of a robot's drives in which a relation does not hold."""
 
-    off_by: float  # root mean square in these stretches, in the unit of y
-    usually: float  # and in the other robots'
-    mended: dict[str, tuple[float, float]]  # by cause: the share that holds without it, its size
+    off_by: float  # root mean square error in these stretches, in the unit of y
+    usually: float  # the same in all stretches of the other robots
+    mended: dict[str, tuple[float, float]]  # cause -> share that holds once it is undone, its size
 
 
 @dataclass
 class Answer:
-    """A relation in logs and twin."""
+    """A relation, compared between logs and twin."""
 
     relation: Relation
     comparisons: list[Comparison]
-    gain: float  # logs over twin; NaN: not known
-    delay: float  # logs less twin, steps
-    rows: FedRows | None = None  # of the logs, if these can be compared with other robots'
-    found: Response | None = None
-    broken: Broken | None = None  # in some stretches, beside other robots
+    gain: float  # logs over twin; NaN if unknown
+    delay: float  # logs less twin, in steps
+    rows: FedRows | None = None  # of the logs; None if not comparable with other robots' rows
+    found: Response | None = None  # of the logs
+    broken: Broken | None = None  # set if it breaks in more stretches than other robots' do
 
     @property
     def off(self) -> bool:
@@ -407,22 +411,22 @@ class Answer:
 
     @property
     def holds(self) -> bool:
-        """Return whether a scale, a delay and a zero of its own make the relation hold."""
+        """Return whether the relation holds once it has its own scale, delay and zero."""
         left = self.found.unexplained if self.found is not None else 0.0
         return not self.is_off("unexplained") and (not self.relation.defined or left <= _LEFT)
 
     @property
     def fine(self) -> bool:
-        """Return whether no comparison is off or undecided."""
+        """Return whether all comparisons are ok or were not run."""
         return all(one.status in ("ok", "not run") for one in self.comparisons)
 
     def is_off(self, figure: str) -> bool:
-        """Return whether the gain, delay or unexplained part is off."""
+        """Return whether a comparison whose check begins with `figure` is off."""
         return any(one.off and one.check.startswith(figure) for one in self.comparisons)
 
 
 def answers(logs: FedRows, twin: FedRows | None, of_twin: TwinFits) -> list[Answer]:
-    """Compare every relation. `of_twin` keeps the twin's fits for the next logs."""
+    """Compare every relation. `of_twin` caches the twin's fits between calls."""
     rng = np.random.default_rng([0, 1])
     return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
 
@@ -440,7 +444,7 @@ def _answer(
     if twin is not None and kept not in of_twin:
         of_twin[kept] = relation.fit(twin, rng, leave_out)
     expected = of_twin.get(kept)
-    name, what = relation.name, f"answer of the {relation.name}"
+    name, what = relation.name, f"response of the {relation.name}"
     if found is not None and relation.zero:
         figure = interval_of(found.gain, found.gains, found.clusters)
         row = judged(
@@ -457,7 +461,7 @@ def _answer(
     most, most_left = (
         (relation.most, UNEXPLAINED) if relation.defined else (NOISY_GAIN, NOISY_UNEXPLAINED)
     )
-    if expected is None:  # a speed equals a speed, and commands precede what they cause
+    if expected is None:  # the gain should be 1, and commands precede what they cause
         gain = interval_of(found.gain, found.gains, found.clusters)
         delay = interval_of(found.delay, found.delays, found.clusters)
         made = [judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
@@ -501,7 +505,7 @@ def _answer(
     ]  # fmt: skip
     made.append(
         shares_compared(
-            f"missions: {name}", "mission without the answer of the " + name,
+            f"missions: {name}", "mission without the response of the " + name,
             found.strayed(expected.kernel), expected.strayed(expected.kernel), -1.0, STRAYED,
         )
     )  # fmt: skip
@@ -510,7 +514,7 @@ def _answer(
 
 
 def held_motion(rows: FedRows) -> list[F64]:
-    """Return the motion (n, 2) of the rows that hold each action: m/s and rad/s by the wheels."""
+    """Return, for each action, the wheels' motion (n, 2) in m/s and rad/s in rows that hold it."""
     held = np.ones(len(rows), np.bool_)
     for lag in range(1, HELD):
         place, known = rows.before(lag)
@@ -523,10 +527,10 @@ ACTION = "action: "
 
 
 def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
-    """Yield how far each logged action's motion is from that action's in the twin.
+    """Yield how far the motion of each logged action is from the same action's motion in the twin.
 
-    Without a twin, the task's table is compared with. The note is the action whose motion most of
-    its rows have: the check is off if that is surely another one.
+    Without a twin, motions are compared with the task's table of actions. `note` is the action to
+    whose motion most rows are nearest. The check is off if that is clearly another action.
     """
     expected = np.array(logs.task.actions, np.float64)
     scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)
@@ -536,16 +540,16 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison
     names = logs.task.action_names
     for action, motion in enumerate(held_motion(logs)):
         name = names[action]
-        what = f"motion under the action {name!r}, held"
+        what = f"motion while the action {name!r} is held"
         if len(motion) < _MIN_HELD:
-            yield not_run(ACTION + name, what, "hardly held in the logs")
+            yield not_run(ACTION + name, what, "too few rows of the logs hold this action")
             continue
         away = np.linalg.norm((motion[:, None] - expected) / scale, axis=2)  # (n, A)
         middle = np.median(away, axis=0)
         nearest = int(np.bincount(away.argmin(axis=1)).argmax())
         share = float((away.argmin(axis=1) == nearest).mean())
         is_other = nearest != action and middle[action] > _AWAY and share >= _MAX_ROWS
-        # A median decided by a share: there is no interval to show.
+        # There is no interval: a share of rows decides.
         yield Comparison(
             ACTION + name, what, "distance", "off" if is_other else "ok",
             logs=float(middle[action]), twin=float(middle[nearest]), effect=float(middle[action]),

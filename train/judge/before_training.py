@@ -1,9 +1,9 @@
 """Diagnose the rows of a panel or store before anything is trained, with the twin alone.
 
 A critic that is fed consistent mistakes learns them, and no figure of its training shows it: logs
-that swap left and right explain themselves. So the rows are held against fresh rows of the twin,
-and against what must hold by definition. Where the twin cannot be driven, the checks
-that need none still run, and the others say why they did not.
+that swap left and right are consistent in themselves. So the rows are compared with fresh rows of
+the twin and with the task's definitions. If the twin cannot be driven, the checks that do not
+need it still run, and the others report why they did not.
 """
 
 from __future__ import annotations
@@ -45,34 +45,36 @@ from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 
-MIN_ROWS = 500  # of the logs, for silence to mean health; and of each part that is compared
-MOST = 40  # parts, of the most rows
+MIN_ROWS = 500  # fewer rows are never called healthy, and smaller parts are not compared
+MOST = 40  # parts that are compared: the largest ones
 RECORDINGS_CHECK = "recordings"
-_SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wrong in all rows
-_NAMED = 3
+_SOME = 0.8  # a fault in a larger share of the parts is reported for all rows
+_NAMED = 3  # parts or files that a text names
 
 
 @dataclass
 class Part:
-    """Rows that are judged by themselves: all of them, or those of a robot or a recording."""
+    """A set of rows that is judged by itself: all rows, or those of one robot or recording."""
 
-    name: str  # "" of all rows
-    kind: str  # robots, recordings, …
+    name: str  # "" for all rows
+    kind: str  # "robots", "recordings" or "groups of recordings"; "" for all rows
     rows: FedRows
     answers: list[Answer] = field(default_factory=list)
     others: list[Comparison] = field(default_factory=list)
 
     @property
     def comparisons(self) -> list[Comparison]:
-        """Return all checks that were made of the rows."""
+        """Return the results of all checks of these rows."""
         return [row for one in self.answers for row in one.comparisons] + self.others
 
 
 def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
-    """Return all rows, then each robot's and each recording's, if several have enough rows.
+    """Split rows into parts: all rows, then each robot's and recording's if several are large.
 
-    Recordings are compared by themselves if each is long enough, else with those around them, or
-    by robot if all are tagged with theirs.
+    If all recordings are tagged with a robot and there are several robots, each robot is a part.
+    Recordings are parts, too, if each has `MIN_ROWS` rows; without robots, shorter recordings are
+    grouped with those that started around the same time. The comparison counts what was compared;
+    it is None if there is one recording.
     """
     parts = [Part("", "", logs)]
     recordings, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
@@ -110,9 +112,9 @@ def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
 
 
 def _by_start(logs: FedRows) -> NDArray[np.str_]:
-    """Return the group of each row (N,); a group has recordings that started consecutively.
+    """Return the group of each row (N,): recordings that started one after the other.
 
-    A group has at least `MIN_ROWS` rows, or enough for `MOST` groups to hold all.
+    A group has at least `MIN_ROWS` rows, or more, so that there are at most `MOST` groups.
     """
     names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
     place = place.reshape(-1)
@@ -120,7 +122,8 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
     np.minimum.at(start, place, logs.logged_ns)
     order = np.argsort(start, kind="stable")
     middle = np.cumsum(rows[order]) - rows[order] / 2
-    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # each loses half of two
+    # A group may lose half of a recording at either end to its neighbours.
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)
     begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
     named = np.empty(len(names), object)
     for first, end in pairwise(begins.tolist()):
@@ -131,7 +134,10 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
 def _of_parts(
     parts: Sequence[Part], each: Sequence[Sequence[Finding]], files: Mapping[str, str]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return each finding once: those of some robots or recordings, and those of all rows."""
+    """Merge the findings of all parts: return those of some robots or recordings, then of all rows.
+
+    `each` has the findings of each part; `files` maps recordings to file names.
+    """
     found = list(each[0])
     kinds = {one.kind: sum(other.kind == one.kind for other in parts) for one in parts[1:]}
     by_cause: dict[tuple[str, str, int], list[tuple[Part, Finding]]] = {}
@@ -143,7 +149,7 @@ def _of_parts(
     said: dict[str, str] = {}
     for (cause, kind, _), some in by_cause.items():
         if said.setdefault(cause, kind) != kind:
-            continue  # said of the robot already
+            continue  # already reported by robot
         if len(some) > _SOME * kinds[kind]:
             if not any(cause == one.cause for one in found):
                 found.append(replace(some[0][1], text=f"in all {kind}: {some[0][1].text}"))
@@ -156,7 +162,7 @@ def _of_parts(
 def _joined(
     each: Sequence[tuple[Part, Finding]], compared: int, files: Mapping[str, str]
 ) -> Finding:
-    """Join the findings of several parts into one, in the words of the first."""
+    """Merge the same finding of several parts into one, with the text of the first."""
     names = ", ".join(_called(part, files) for part, _ in each[:_NAMED])
     more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
     first, kind = each[0][1], each[0][0].kind
@@ -169,7 +175,7 @@ def _joined(
 
 
 def _called(part: Part, files: Mapping[str, str]) -> str:
-    """Return a part's name, with the files of its recordings."""
+    """Return a part's name for people: a recording's file, or a robot with its files."""
     recordings = np.unique(part.rows.recording).tolist()
     names = [files.get(one, one) for one in recordings[:_NAMED]]
     if part.name in recordings:
@@ -190,21 +196,21 @@ class RowDiagnosis:
     verdict: Verdict
     findings: list[Finding]
     comparisons: list[Comparison]
-    about: dict[str, Any]  # what was looked at
+    about: dict[str, Any]  # counts of the rows, the path, the profile and its task, seconds taken
 
     @property
     def not_run(self) -> list[Comparison]:
-        """Return the checks that could not be made, each with the reason in `note`."""
+        """Return the checks that could not run, each with the reason in `note`."""
         return [row for row in self.comparisons if row.status == "not run"]
 
 
 class OpenedRows(NamedTuple):
-    """Opened rows, and what comes with them from their store."""
+    """Rows of a panel or store, with what their store adds."""
 
     rows: FedRows
     profile: Profile
-    checks: list[Flags]  # with the signals of their store
-    files: dict[str, str]  # recording -> its file's name
+    checks: list[Flags]  # results of the checks that need the store
+    files: dict[str, str]  # recording ID -> file name
 
 
 def diagnose_before_training(
@@ -218,15 +224,15 @@ def diagnose_before_training(
     """Compare the rows of a panel or store with the twin and with the task's definitions.
 
     Args:
-        profile: whose task and conditions the twin is driven with; None: that of the rows.
-        twin: False: only the checks that need none.
-        perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
-        layouts: the floors that the twin drives on, as `env.layouts`.
+        profile: defines the task and conditions of the twin; None: the profile of the rows.
+        twin: False: only run the checks that do not need the twin.
+        perturbation: of the twin, as `restock twin fit` fits it; None: the nominal twin.
+        layouts: the floors that the twin drives on, in the form of `env.layouts`.
 
     Raises:
-        RunError: there is not a panel or a store.
-        PanelError, StoreError: it is damaged, has no rows, or its profile is not at hand.
-        ConfigError: the profile's task is not that of the rows.
+        RunError: the path is neither a panel nor a store.
+        PanelError, StoreError: it is damaged or has no rows, or its profile cannot be found.
+        ConfigError: the rows are of another task than the profile's.
     """
     begun = time.perf_counter()
     opened = open_rows(Path(path), profile)
@@ -249,10 +255,10 @@ def diagnose_rows(
     more: Sequence[Flags] = (), floors: Sequence[Warehouse] = (),
     files: Mapping[str, str] | None = None,
 ) -> RowDiagnosis:  # fmt: skip
-    """Diagnose opened rows, all of them and each robot's and recording's.
+    """Diagnose rows: all of them, and those of each robot and recording.
 
-    `reason` says why there are no rows of a twin. `more` are checks made elsewhere, which count
-    alike. `floors` are those that the twin drives on; `files` names recordings.
+    `reason` is why `twin` is None. `more` are results of checks made elsewhere, which count in the
+    same way. `floors` are those that the twin drives on; `files` maps recordings to file names.
     """
     parts, compared = parts_of(rows)
     of_twin: TwinFits = {}  # the same for every part
@@ -301,7 +307,7 @@ def open_rows(path: Path, profile: Profile | None = None) -> OpenedRows:
     """Open the rows of a panel or a store.
 
     Raises:
-        as `diagnose_before_training`.
+        RunError, PanelError, StoreError, ConfigError: as `diagnose_before_training`.
     """
     if (path / HEADER).is_file():
         panel = Panel.open(path)
@@ -333,24 +339,25 @@ def open_rows(path: Path, profile: Profile | None = None) -> OpenedRows:
 
 
 def _checked(own: Profile, rows: FedRows, path: Path) -> Profile:
-    """Return the profile; raise ConfigError if its task is not that of the rows."""
+    """Return the profile; raise ConfigError if the rows are of another task."""
     if own.task.hash == rows.task.hash:
         return own
     raise ConfigError(
-        f"profile {own.name!r} defines task {own.task.hash}, the rows are of {rows.task.hash}",
+        f"profile {own.name!r} defines task {own.task.hash}, but the rows are of task"
+        f" {rows.task.hash}",
         where=str(path),
-        remedy="give the profile with which they were ingested",
+        remedy="pass the profile that these rows were ingested with",
     )
 
 
 def _files(store: Store) -> dict[str, str]:
-    """Return the name of each recording's file."""
+    """Map each recording's ID to its file name."""
     found = store.connection.sql("SELECT recording_id, source_file FROM recordings").fetchall()
     return {str(name): Path(path).name for name, path in found}
 
 
 def _conditions(profile: Profile) -> list[Condition]:
-    """Return those of a profile's conditions that the twin's signals can say."""
+    """Return the profile's conditions that can be computed from the twin's signals."""
     return conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[0]
 
 
@@ -367,5 +374,5 @@ def _drive(
     try:
         rows = drive_twin(task, conditions, robot=robot, perturbation=perturbation, layouts=layouts)
         return rows, ""
-    except RestockError as error:  # no such robot in the twin: the other checks still say much
+    except RestockError as error:  # the twin lacks such a robot, but the other checks are useful
         return None, f"the twin cannot be driven with this profile: {error.what}"

@@ -1,7 +1,7 @@
 """Compare robots of a fleet with each other: relations, stretches of drives, and values.
 
-Robots of a fleet differ less from each other than from the twin. A fault that lasts for a part of
-a drive shows in its stretches, and one that replaces values shows in how these repeat.
+Robots of a fleet differ less from each other than from the twin. A fault that lasts for part of a
+drive shows in some stretches of it. A fault that replaces values shows in how often these repeat.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from restock.train.judge.answers import Answer, Broken, Relation, lagged, wheel_
 from restock.train.judge.fed_rows import Comparison, FedRows, judged, shares_compared
 from restock.train.judge.row_checks import implied_reward
 
-MIN_BESIDE = 4  # robots or recordings, for one to be the odd one out
-_ALIKE = 0.75  # of the others, for what they agree on to be the measure
-GAIN, ANSWER, NOISY = 1.02, 1.15, 1.25  # of two sensors of one motion, of commands, of the others
-_DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # most beside the others; the latter of the mean square
+MIN_BESIDE = 4  # robots or recordings, of which one can be the odd one out
+_ALIKE = 0.75  # share of the other robots that must agree, to serve as the reference
+GAIN = 1.02  # largest gain over the others', or its inverse, for two sensors of one motion
+ANSWER, NOISY = 1.15, 1.25  # the same for responses to commands, and for all other relations
+_DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences; the latter of y's mean square
 
 
 def beside_others(
     parts: Sequence[FedRows], answers: Sequence[Sequence[Answer]]
 ) -> list[list[Comparison]]:
-    """Compare robots: each one's relations and repeated values with those of the others.
+    """Compare the relations and the repeated values of each robot with those of the others.
 
-    Adds comparisons to the answers of each robot, and returns the comparisons of its values.
+    Adds comparisons of relations to `answers`, and returns those of values, per robot.
     """
     if len(parts) < MIN_BESIDE:
         return [[] for _ in parts]
@@ -50,7 +51,7 @@ def beside_others(
 
 
 def _relation_beside(answers: Sequence[Answer]) -> None:
-    """Compare one relation in several robots: each with the middle of the others."""
+    """Compare each robot's figures of one relation with the median of the others."""
     for figure, least, most in _allowed(answers[0].relation):
         rows = [_of_figure(one, figure) for one in answers]
         for place, own in enumerate(rows):
@@ -63,8 +64,8 @@ def _relation_beside(answers: Sequence[Answer]) -> None:
 
 
 def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
-    """Return the figures in which robots may be compared, and their ranges beside the others."""
-    if relation.y == ends.PLAN:  # where robots are sent differs
+    """Return the figures to compare between robots, with the allowed range of each."""
+    if relation.y == ends.PLAN:  # robots are sent to different places
         return []
     gain = GAIN if relation.most == ends.ALIKE else ANSWER if relation.defined else NOISY
     return [
@@ -75,14 +76,14 @@ def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
 
 
 def _of_figure(answer: Answer, figure: str) -> Comparison | None:
-    """Return a robot's own comparison of a figure; None if it has none."""
+    """Return the robot's comparison of a figure with the twin; None if there is none."""
     return next((row for row in answer.comparisons if row.check.startswith(f"{figure}: ")), None)
 
 
 def _beside(
     figure: str, own: Comparison, others: Sequence[Comparison], least: float, most: float
 ) -> Comparison | None:
-    """Compare a figure with the middle of the others'; None if these are few or do not agree.
+    """Compare a figure with the median of the others; None if they are too few or do not agree.
 
     Gains are compared by their ratio, other figures by their difference.
     """
@@ -97,7 +98,7 @@ def _beside(
     else:
         at, away, far = at - middle, values - middle, most
     if np.mean(np.abs(away) <= far) < _ALIKE:
-        return None  # it may be they
+        return None  # the others may be wrong
     name = own.check.removeprefix(f"{figure}: ")
     return _only_off(
         judged(
@@ -115,24 +116,25 @@ def _beside(
 
 
 def _only_off(row: Comparison) -> Comparison:
-    """Let a comparison count only if it is off: to differ raises no suspicion."""
+    """Turn "undecided" into "ok": robots may differ somewhat without raising suspicion."""
     if not row.off:
         row.status = "ok"
     return row
 
 
 _WINDOW = 10  # steps of a stretch
-_USUAL, _BROKEN = 0.98, 2.0  # a stretch is broken beyond this quantile of the others', times
-_IN_PART = 0.05  # of the stretches, beyond the others'
-_FEW = 0.25  # of the rows in broken stretches, if single values are to be far off
-_COUNTS = 0.1  # of the largest of a kernel: what less counts for is not part of a value
-_STEPS = (*range(-10, 0), *range(1, 11))  # of a shift
+_USUAL, _BROKEN = 0.98, 2.0  # a stretch breaks beyond this quantile of the others' errors, times 2
+_IN_PART = 0.05  # largest share of broken stretches, less the others'
+_FEW = 0.25  # spikes are a smaller share of the rows in broken stretches
+_COUNTS = 0.1  # lags with a smaller share of the kernel's largest weight are ignored
+_STEPS = (*range(-10, 0), *range(1, 11))  # shifts that are tried
 
 
 def _stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) -> None:
-    """Compare in how many stretches of a drive each robot's relation breaks, beside the others'.
+    """Compare the share of stretches in which a relation breaks between each robot and the others.
 
-    All are held against one response: the middle of the robots' own.
+    All stretches are compared with one response: the median of the robots' fits. `odd` has each
+    robot's tallies that are off, by check.
     """
     relation = answers[0].relation
     fits = [one.found for one in answers if one.found is not None]
@@ -174,7 +176,7 @@ def _stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) ->
 
 
 def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:
-    """Return the rows (N,) that odd values of the relation's signals are part of, by check."""
+    """Return which rows (N,) use an odd value of one of the relation's signals, by check."""
     lags = relation.lags[np.abs(kernel) > _COUNTS * np.abs(kernel).max()]
     found = {}
     for check, one in odd.items():
@@ -182,7 +184,7 @@ def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[
             continue
         if one.signal == relation.x:
             found[check] = np.any([np.roll(one.rows, lag) for lag in lags], axis=0)
-        else:  # a motion of the pose is between two poses
+        else:  # a motion of the pose uses two poses
             after = np.append(one.rows[1:], False) & (one.signal == ends.POSE)
             found[check] = one.rows | after
     return found
@@ -190,22 +192,23 @@ def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[
 
 @dataclass(frozen=True)
 class Stretches:
-    """What a relation expects of a robot, and leaves unexplained, in W stretches of its drives."""
+    """Expected and measured y of one robot and relation, cut into W stretches of its drives."""
 
     expected: F64  # (N,) by the relation
     measured: F64  # (N,)
     episode: Ints  # (N,)
     at: Ints  # (n,) rows that are judged
     stretch: Ints  # (n,) codes
-    left: F64  # (W,) mean square that the relation leaves
-    moves: F64  # (W,) and that it expects
+    left: F64  # (W,) mean square error of the relation
+    moves: F64  # (W,) mean square of the expected y
 
     @classmethod
     def of(cls, relation: Relation, rows: FedRows, kernel: F64, offset: float) -> Stretches:
-        """Cut a robot's rows; wheels that slip are no fault, and stretches of few rows are none."""
+        """Cut a robot's rows, without those that slip and stretches with under half their rows."""
         x, measured = relation.of(rows)
         expected = lagged(x, [rows.before(int(lag)) for lag in relation.lags]) @ kernel + offset
-        # A wrong pose is labelled as slip, too, but moves the robot more than its wheels turn.
+        # Rows with a wrong pose are labelled as slip, too, but there the pose moves more than the
+        # wheels turn.
         slips = np.abs(rows.after("localised_speed")) < np.abs(rows.after("wheel_speed"))
         if ends.WHEEL_TURN in (relation.x, relation.y):
             slips = np.abs(rows.after("gyro_yaw_rate")) < np.abs(wheel_turn(rows))
@@ -223,18 +226,20 @@ class Stretches:
         return cls(expected, measured, rows.episode, at, stretch, left, moves)
 
     def relative_error(self, usually: float) -> F64:
-        """Return how far off each stretch is (W,), over how much it moves and is usual to move."""
+        """Return the error of each stretch (W,), over its motion plus the usual mean square."""
         return np.sqrt(self.left / np.maximum(self.moves + usually, 1e-12))
 
     def mended(
         self, broken: Bools, most: float, usually: float, odd: Mapping[str, Bools]
     ) -> dict[str, tuple[float, float]]:
-        """Return the share of broken stretches that hold without each cause, and the cause's size.
+        """Return the share of broken stretches that hold once each cause is undone, and its size.
 
         Args:
-            broken: (W,)
+            broken: which stretches (W,) break.
             most: relative error up to which a stretch holds.
-            odd: rows (N,) whose values are odd by themselves, by check: without them, it may hold.
+            usually: usual mean square of the expected y.
+            odd: rows (N,) that use odd values, by check; each check is a cause that is undone by
+                leaving out its rows.
         """
         inside = broken[self.stretch]
         expected, measured = self.expected[self.at], self.measured[self.at]
@@ -261,7 +266,7 @@ class Stretches:
         }
 
     def _later(self, steps: int) -> F64:
-        """Return what was expected some steps before, (n,); NaN if that is another episode."""
+        """Return the expected y `steps` earlier, (n,); NaN if that is in another episode."""
         row = np.clip(self.at - steps, 0, len(self.expected) - 1)
         same = self.episode[row] == self.episode[self.at]
         return np.where(same, self.expected[row], np.nan)
@@ -269,7 +274,7 @@ class Stretches:
     def _held(self, expected: F64, broken: Bools, most: float, usually: float) -> float:
         """Return the share of broken stretches that hold with other expected values (n,).
 
-        Rows whose value is NaN are left out.
+        Rows with NaN are left out.
         """
         known = np.isfinite(expected)
         stretch, expected = self.stretch[known], expected[known]
@@ -289,44 +294,44 @@ PROPOSED, REPLACED = "proposed: ", "goals replaced"
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of tally: what is counted, and how much more than the others' is too much."""
+    """A kind of tally: what is counted, and the largest share beyond the other robots'."""
 
-    what: str
+    what: str  # for people
     most: float
 
 
 _KINDS = {
     COPIED: _Kind("row in which the robot moves and the value is exactly another signal's", 0.05),
-    PROPOSED: _Kind("action of a driver that is navigation's proposal", 0.1),
+    PROPOSED: _Kind("action of a driver that equals navigation's proposal", 0.1),
     REPLACED: _Kind("episode whose goal is replaced before it is reached", 0.1),
-    HELD: _Kind("row in which the robot moves and the value of the row before stays", 0.05),
+    HELD: _Kind("row in which the robot moves and the value equals that of the row before", 0.05),
     ZEROS: _Kind("row in which the robot moves and the value is 0", 0.02),
-    LIMIT: _Kind("row in which the value is its largest, which is less than others'", 0.04),
-    ROUNDED: _Kind("value that comes again elsewhere, as of rounding", 0.3),
+    LIMIT: _Kind("row in which the value is at its maximum, which other robots exceed", 0.04),
+    ROUNDED: _Kind("value that comes again elsewhere, as if rounded", 0.3),
     FAR: _Kind("sector that sees nothing", 0.1),
     FLICKER: _Kind("sector that sees something else for one row", 0.02),
     REWARDS: _Kind("row's reward is not exactly the task's own", 0.02),
 }
 _MOVES = 0.2  # of the fastest command
-_EQUAL = 1e-5  # of a signal's spread
-_SAME = 1e-4  # m/s or rad/s: one and the same value
+_EQUAL = 1e-5  # of a signal's spread: smaller differences are none
+_SAME = 1e-4  # m/s or rad/s: smaller differences between two signals are none
 _MIN_DRIVEN = 100  # rows of a driver
-_LESS = 0.9  # of the largest value of others
-_UNSEEN = 0.999  # of the lidar's entry
-_JUMP, _STILL = 0.15, 0.05  # of it
-_EXACT = 2e-3
+_LESS = 0.9  # a limit counts below this share of the others' median
+_UNSEEN = 0.999  # lidar entries from here on saw nothing
+_JUMP, _STILL = 0.15, 0.05  # a flicker differs from both neighbours; these hardly differ
+_EXACT = 2e-3  # largest error of a reward that is the task's own
 
 
 @dataclass(frozen=True)
 class Tally:
-    """How many rows of a robot are so, of those that could be."""
+    """A count of a robot's rows, values or episodes with some oddity: `found` of `of`."""
 
-    kind: str
-    signal: str  # an end of the relations; "" where the kind has one signal alone
+    kind: str  # a key of `_KINDS`
+    signal: str  # a signal of the relations, or a driver; "" if the kind needs none
     found: int
     of: int
-    size: float = 0.0  # seconds at a time, or the largest value
-    rows: Bools | None = None  # (N,) with such a value, if these can be left out
+    size: float = 0.0  # seconds at a time for `HELD`, the largest value for `LIMIT` and `FAR`
+    rows: Bools | None = None  # (N,) with the oddity, if relations can be tested without them
     note: str = ""
 
     @property
@@ -335,7 +340,7 @@ class Tally:
 
 
 def tallies(rows: FedRows) -> Iterator[Tally]:
-    """Count, in one robot's rows, what is compared with other robots'."""
+    """Count in one robot's rows all that is compared between robots."""
     copied: dict[str, Bools] = {}
     for signal, moves, same, note in _copies(rows):
         copied[signal] = same
@@ -355,7 +360,7 @@ def tallies(rows: FedRows) -> Iterator[Tally]:
 
 
 def _signals(rows: FedRows) -> Iterator[tuple[str, F64, Bools]]:
-    """Yield a signal's name, its values (N,), and in which rows it should change."""
+    """Yield each signal's name, its values (N,), and in which rows (N,) it should change."""
     command = np.abs(rows.command()) / np.maximum(np.abs(rows.task.actions).max(axis=0), 1e-9)
     drives, turns = (command > _MOVES).T
     yield ends.WHEEL_SPEED, rows.after("wheel_speed"), drives
@@ -373,16 +378,17 @@ def _signals(rows: FedRows) -> Iterator[tuple[str, F64, Bools]]:
 def _repeats(
     signal: str, value: F64, before: Ints, known: Bools, copied: Bools, period_s: float
 ) -> Iterator[Tally]:
-    """Count how the values (N,) of a signal repeat, in `known` rows; `before` is the row before.
+    """Count how the values (N,) of a signal repeat in `known` rows.
 
-    Values that are `copied` may come again without being coarse.
+    `before` is the index of each row's predecessor. Values that are `copied` do not count as
+    rounded.
     """
     finite = np.where(np.isfinite(value), value, 0.0)
     step = _EQUAL * max(float(np.subtract(*np.quantile(finite[known], [0.95, 0.05]))), 1e-9)
     code = np.unique(np.round(finite / step), return_inverse=True)[1].reshape(-1)
     same = code == code[before]
     begins = known & ~same
-    comes = np.bincount(code, begins)[code]  # how often a value begins anew
+    comes = np.bincount(code, begins)[code]  # how many separate times the value occurs
     largest = float(np.abs(finite[known]).max())
     zero = np.abs(finite) < step
     limit = (np.abs(finite) > largest - step) & (comes > 1)
@@ -402,7 +408,11 @@ def _repeats(
 
 
 def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
-    """Yield a signal, in which rows (N,) it moves, and in which it is exactly another: which."""
+    """Yield signals that may repeat another one.
+
+    Each comes with the rows (N,) in which it moves, those in which it also equals the other, and
+    the other's name.
+    """
     speed, turn = rows.command().T
     for signal, value, other, of in (
         (ends.WHEEL_SPEED, rows.after("wheel_speed"), speed, "the command"),
@@ -415,7 +425,7 @@ def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
 
 
 def _of_drivers(rows: FedRows) -> Iterator[Tally]:
-    """Count the actions of each driver that are those nearest to navigation's proposals."""
+    """Count, for each driver, the actions that are nearest to navigation's proposal."""
     near, offset, says = proposal_reader(rows.task)
     nearest = (rows.observation @ near.T + offset).argmax(axis=1)
     known = rows.observation @ says > 0.5
@@ -427,7 +437,7 @@ def _of_drivers(rows: FedRows) -> Iterator[Tally]:
 
 
 def _of_goals(rows: FedRows) -> Iterator[Tally]:
-    """Count episodes that are cut and go on in the next step as another one."""
+    """Count truncated episodes after which the recording goes on at the next step."""
     recording = np.unique(rows.recording, return_inverse=True)[1].reshape(-1)
     order = np.lexsort((rows.logged_ns, recording))
     later_s = np.diff(rows.logged_ns[order]) * 1e-9
@@ -439,7 +449,7 @@ def _of_goals(rows: FedRows) -> Iterator[Tally]:
 
 
 def _of_lidar(rows: FedRows) -> Iterator[Tally]:
-    """Count sectors that differ for one row from the rows around it, or that see nothing."""
+    """Count sectors that differ for one row from the rows around it, see nothing, or read 0."""
     now = rows.sectors()
     (back, first), (on, last) = rows.before(1), rows.before(-1)
     apart = np.minimum(np.abs(now - now[back]), np.abs(now - now[on]))
@@ -454,7 +464,7 @@ def _of_lidar(rows: FedRows) -> Iterator[Tally]:
 
 
 def _signals_beside(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[Comparison]]:
-    """Compare each robot's tallies with those of the other robot that has most."""
+    """Compare each tally of a robot with the largest one among the others."""
     made: list[list[Comparison]] = [[] for _ in each]
     for key in sorted({key for of_part in each for key in of_part}):
         for place, of_part in enumerate(each):
@@ -483,9 +493,9 @@ def _signals_beside(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[C
 
 
 def _largest(each: Iterator[Tally]) -> dict[tuple[str, str], Tally]:
-    """Return the tallies by kind and signal: of several of one signal, the largest share.
+    """Return tallies by kind and signal; of several with the same key, that of the largest share.
 
-    Its rows are those of all of them.
+    Its `rows` are the union of theirs.
     """
     found: dict[tuple[str, str], Tally] = {}
     for one in each:

@@ -1,8 +1,8 @@
-"""Infer what is wrong with logs from the comparisons that are off, in their owner's words.
+"""Infer what is wrong with logs from the comparisons that are off, in words for their owner.
 
-A sensor whose readings are scaled, turned round or late is off in every relation that it takes part
-in, and the others agree among themselves. So the smallest set of ends that all failing relations
-share is at fault.
+A sensor whose readings are scaled, reversed or late breaks every relation that uses it, while the
+other sensors agree with each other. So the fault is in the smallest set of signals that the broken
+relations have in common. The signals x and y of a relation are called its ends.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from restock.train.judge.mission_checks import CHOSEN
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
 GOALS = "GOALS_OF_OTHERS"
-_FIRST = (  # nothing can be told of rows before these
+_FIRST = (  # no other check of rows means anything until these are mended
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
-# What one value shows, first what explains the others.
+# Checks of a signal's values. If several are off, the first explains the others.
 OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
-_PARTS = ("shifted", "scaled", "biased", "spikes")  # of causes that mend alike, the first
-_UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # else by its own name
-_ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # by figures that should be 0
-_OPPOSITE, _NONE = -0.6, 0.3  # of what is expected, at most
-MENDED = 0.8  # of the stretches that break, those that hold once a cause is undone, at least
-CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
-COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
+_PARTS = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; ties: the first
+_UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # kind -> its name in `Broken.mended`
+_ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # figure that should be 0
+_OPPOSITE, _NONE = -0.6, 0.3  # a scale below these is reversed, or stands still
+MENDED = 0.8  # least share of broken stretches that hold once a cause is undone
+CHANGED = "ACTIONS_CHANGED"  # then the profile is not to blame for anything that actions show
+COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion even if all else is right
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
 _UNITS = (
     ((50.0, 65.0), "degrees in place of radians"),
@@ -61,15 +61,15 @@ _UNITS = (
 class Finding:
     """A fault in the logs' rows."""
 
-    cause: str  # a name that docs and programs know it by
-    text: str  # what, by how much
+    cause: str  # its name in docs and JSON
+    text: str  # what is wrong, and by how much
     remedy: str
-    evidence: tuple[str, ...]  # the comparisons it rests on, by `check`
+    evidence: tuple[str, ...]  # the `check` of each comparison that shows it
 
 
 def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task) -> list[Finding]:
     """Return the faults, the least understood last."""
-    of_signals: dict[str, Comparison] = {}  # by the kind of check, and the signal
+    of_signals: dict[str, Comparison] = {}  # by `check`
     moved: list[Comparison] = []
     rest: list[Comparison] = []
     for row in others:
@@ -79,24 +79,24 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
             (moved if row.check.startswith(ACTION) else rest).append(row)
     of_rows = _of_rows(rest)
     first = [one for one in of_rows if one.cause in _FIRST]
-    if first:  # what rows are made of, and all that is compared with their next, follows from it
+    if first:  # all else that is off may follow from these
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
     found, shown = _of_signals(of_signals, of_rows, answers)
     ends = odd_ends([one for one in answers if not _has(one, shown)])
     one_to_one = len({row.note for row in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
-    # Actions that are late or early are found in place of others, too.
+    # Late or early actions look permuted, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
     changed = [one for one in of_rows if one.cause == CHANGED]
-    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # then motion shows nothing
+    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # wrong wheels: their motion is unknown
     if not changed and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
         changed = [_permuted(moved, task)]
     if changed:
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
-        ends.pop(PLAN, None)  # of another goal, not of another scale
+        ends.pop(PLAN, None)  # another goal explains the plan's scale
     if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows):
-        ends.pop(LIDAR, None)  # it is known why
+        ends.pop(LIDAR, None)  # these causes explain it
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
     found += changed + [_of_end(end, off, task) for end, off in ends.items()]
@@ -108,12 +108,12 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
 def _of_signals(
     off: dict[str, Comparison], of_rows: Sequence[Finding], answers: Sequence[Answer]
 ) -> tuple[list[Finding], tuple[str, ...]]:
-    """Return the findings of signals' own values, and which signals (ends) these explain."""
+    """Return the findings from signals' own values, and the signals that these explain."""
     causes = {one.cause for one in of_rows}
     if "EPISODES_REPEATED" in causes:
-        return [], ()  # every value comes again
+        return [], ()  # repeated episodes repeat every value
     if "LIDAR_OFF" in causes:
-        off.pop(ZEROS + LIDAR, None)  # of what is nearer than that
+        off.pop(ZEROS + LIDAR, None)  # too short ranges of near things become 0
     by_end: dict[str, list[tuple[str, Comparison]]] = {}
     for check, row in off.items():
         kind = next(one for one in OF_SIGNALS if check.startswith(one))
@@ -121,7 +121,7 @@ def _of_signals(
         if _mends(check, [one for one in answers if _has(one, (end,))]):
             by_end.setdefault(end, []).append((kind, row))
     if POSE in by_end or POSE in odd_ends(answers):
-        by_end.pop(PLAN, None)  # seen from the pose
+        by_end.pop(PLAN, None)  # it is measured from the pose
     shown, found = tuple(by_end), []
     if by_end.keys() >= set(GROUPS["wheels"]):
         by_end["wheels"] = by_end.pop(WHEEL_SPEED) + by_end.pop(WHEEL_TURN)
@@ -135,9 +135,9 @@ def _of_signals(
 
 
 def _mends(check: str, answers: Sequence[Answer]) -> bool:
-    """Return whether most of the relations that break hold without the values of a check.
+    """Return whether most of the broken relations hold without the values that a check found.
 
-    Copies and coarse values are plain to see.
+    Also true if no relation tests this, and for copied and rounded values, which need no proof.
     """
     broken = [one.broken.mended for one in answers if one.broken]
     shares = [mended[check][0] for mended in broken if check in mended]
@@ -145,7 +145,7 @@ def _mends(check: str, answers: Sequence[Answer]) -> bool:
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
-    """Return the ends that faulty relations have in common, each with those relations."""
+    """Return a small set of ends that covers all faulty relations: end -> relations it explains."""
     left = [one for one in answers if one.off]
     fine = [one for one in answers if one.fine and one.relation.defined]
     names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
@@ -174,7 +174,7 @@ def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
     """Return the factor by which an end's values are scaled, and how many steps late they are."""
     ends = GROUPS.get(end, (end,))
     scales, delays = [], []
-    if any(one.is_off("delay") for one in off):  # no scale shows where a delay is not fitted
+    if any(one.is_off("delay") for one in off):  # scales are wrong in relations without a delay
         off = [one for one in off if len(one.relation.lags) > 1]
     for one in off:
         is_answer = one.relation.y in ends
@@ -190,9 +190,9 @@ def _is_shift(scale: float, delay: float) -> bool:
 
 
 def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
-    """Return the cause that makes the relations of an end hold; else, how they do not."""
+    """Return the cause which, once undone, makes an end's relations hold; else describe them."""
     rows = [row for one in off for row in one.comparisons if row.off]
-    named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # the first of each figure
+    named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # figure -> its first row
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
     scale, steps, bias = (*_distortion(end, off), 0.0)
     kind, some, mended, in_part = "", named.get("stretches"), _mended(end, off), ""
@@ -232,22 +232,22 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
 def _of_all(
     end: str, scale: float, steps: float, off: Sequence[Answer], named: Container[str]
 ) -> str:
-    """Return what is wrong in all rows, if relations hold with a scale, delay and zero; or ""."""
+    """Return the kind of a fault that is the same in all rows; "" if it is not clear."""
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
     if scale < 0:
         kind = "opposite" if is_action else "reversed"
         return kind if _surely_reversed(off) else ""
     if _is_shift(scale, steps):
         return "shifted"
-    if scale != 1:  # no scale mends a zero, and a lidar's is in what it is compared with, too
+    if scale != 1:  # a scale cannot mend an offset, and a lidar's scale cancels in its relations
         return "scaled" if "offset" not in named and end != LIDAR else ""
     return next((kind for figure, kind in _ZEROS.items() if figure in named), "")
 
 
 def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
-    """Return the share of broken stretches that undoing each cause mends, and the cause's size.
+    """Return the share of broken stretches that hold once each cause is undone, and its size.
 
-    Medians of the end's relations; nothing if none of them breaks in some stretches.
+    Both are medians over the end's relations. Empty if no relation breaks in some stretches only.
     """
     ends = GROUPS.get(end, (end,))
     found: dict[str, list[tuple[float, float]]] = {}
@@ -256,7 +256,7 @@ def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
             continue
         for cause in _PARTS:
             share, by = one.broken.mended.get(cause, (0.0, 1.0))
-            if one.relation.y not in ends:  # what is wrong is expected
+            if one.relation.y not in ends:  # the end is the relation's x
                 by = 1 / by if cause == "scaled" and by else -by
             found.setdefault(cause, []).append((share, by))
     return {
@@ -269,7 +269,7 @@ def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
 
 
 def _how(end: str, off: Sequence[Answer], named: Mapping[str, Comparison]) -> str:
-    """Return in words which signals an end does not follow, in how much of the drive, how far."""
+    """Describe which signals an end does not follow, in how much of the drive, and by how much."""
     ends = GROUPS.get(end, (end,))
     signals = dict.fromkeys(one for each in off for one in (each.relation.x, each.relation.y))
     *others, last = [one for one in signals if one not in ends] or ["where it heads"]
@@ -284,7 +284,7 @@ def _how(end: str, off: Sequence[Answer], named: Mapping[str, Comparison]) -> st
 
 
 def _surely_reversed(off: Sequence[Answer]) -> bool:
-    """Return whether each gain that is off is below 0 with its whole interval, unlike noise."""
+    """Return whether all gains that are off are surely negative; noise makes some so by chance."""
     gains = [
         row for one in off for row in one.comparisons if row.off and row.check.startswith("gain")
     ]
@@ -305,9 +305,9 @@ def _permuted(moved: Sequence[Comparison], task: Task) -> Finding:
 
 
 def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
-    """Return findings of checks that imply their cause; the first one claims a check."""
+    """Return the findings of checks that imply their cause; a check counts for one finding only."""
     left = {row.check: row for row in off}
-    if "driver" in left:  # another driver's actions are proposals as often as that one's
+    if "driver" in left:  # the wrong driver also explains how many of its actions are proposals
         left = {name: row for name, row in left.items() if not name.startswith(PROPOSED)}
     found: list[Finding] = []
     for kind in TABLES.kinds:
@@ -332,7 +332,7 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Kind:
-    """A cause, as `causes.toml` has it."""
+    """A cause, as defined in `causes.toml`."""
 
     cause: str
     text: str
@@ -341,7 +341,7 @@ class Kind:
     beside: tuple[str, ...] = ()
 
     def finding(self, evidence: tuple[str, ...], **known: Any) -> Finding:
-        """Return the finding of this cause, its words filled in with what is `known`."""
+        """Return the finding of this cause, with its texts filled in from `known`."""
         cause, text, remedy = (one.format(**known) for one in (self.cause, self.text, self.remedy))
         return Finding(cause, text, remedy, evidence)
 

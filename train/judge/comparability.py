@@ -1,12 +1,11 @@
-"""Decide whether two arms were the same but for the treatment: their settings, and what was fed.
+"""Decide whether two arms differ only in the treatment: by their settings, and by what was fed.
 
-A difference test asks the wrong question of a feed: at a million draws it rejects trifles, and it
-takes rows of one episode for independent ones. So two feeds are comparable only if the data show
-that they differ by *at most* a stated limit. Shares are of conditions, which mean the same in both
-runs; a stratum is whatever its own run's mixture says. What a mixture fixes (the logged rows, by
-quotas and in turns) is compared as it is; what is random (which fresh episodes there were) is
-resampled by whole episodes. Total variation distance alone does not see a rare condition, hence the
-ratios.
+A test for a difference does not suit feeds: with a million draws it rejects trifles, and it takes
+rows of one episode for independent ones. So two feeds are comparable only if the data show that
+they differ by *at most* a stated limit. Shares are of conditions, which mean the same in both runs;
+the meaning of a stratum depends on its mixture. What a mixture fixes (the logged rows) is compared
+directly. What is random (the fresh episodes) is resampled by whole episodes. Total variation
+distance alone does not show a rare condition, so ratios of shares are checked, too.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ from restock.toml import by_path
 from restock.train.run.run import Run
 
 Verdict = Literal["comparable", "inconclusive", "incomparable"]
-_CHECKS = 30  # about as many are made of random figures
+_CHECKS = 30  # approximate number of checks of random figures in a comparison
 _ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
 
 
 @dataclass(frozen=True)
 class ComparabilityLimits:
-    """What still counts as the same feed."""
+    """Limits within which two feeds count as the same."""
 
-    distance: float = 0.02  # total variation between the mixes of the whole run
-    tenth_distance: float = 0.05  # … of one tenth of it, which has a tenth of the episodes
+    distance: float = 0.02  # total variation distance between the mixes of the whole run
+    tenth_distance: float = 0.05  # the same of a tenth of the run, with a tenth of the episodes
     share_ratio: float = 1.25  # of a condition's shares
-    share_floor: float = 0.0005  # conditions below this share in both are not asked for a ratio
+    share_floor: float = 0.0005  # no ratio is checked for a smaller share in both feeds
     unlabelled: float = 0.5  # share of the fresh rows drawn before their episode had labels
     episode_ratio: float = 1.5  # of the numbers of episodes that a condition was drawn from
     confidence: float = 0.95
@@ -53,18 +52,18 @@ LIMITS = ComparabilityLimits()
 
 @dataclass(frozen=True)
 class Feed:
-    """What one arm's critics were fed: draws by cell (source/condition), tenth and episode.
+    """What one arm's critics were fed: draws by run, cell, tenth of the training and episode.
 
-    Rows are sums over the draws of one episode in one cell and tenth.
+    A cell is a source and a condition. Each of the n rows sums the draws of one combination.
     """
 
     cells: list[str]  # "logs/wheel_slip", …
-    cell: Ints  # (n,)
+    cell: Ints  # (n,) index in `cells`
     tenth: Ints  # (n,) 0 to 9
-    episode: Ints  # (n,) fresh ones are distinct over the arm's runs
-    run: Ints  # (n,)
-    drawn: F64  # (n,)
-    weight: F64  # (n,) the sum of importance weights
+    episode: Ints  # (n,) codes; fresh episodes of different runs have different codes
+    run: Ints  # (n,) index of the run in its arm
+    drawn: F64  # (n,) number of draws
+    weight: F64  # (n,) sum of their importance weights
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Check:
 
     name: str  # "mix", "mix after weights", "share of logs/wheel_slip", …
     part: str  # "whole run", or "tenth 3"
-    first: float | None  # the arms' own figures, where there are such
+    first: float | None  # the figure of each arm, if the check has one
     second: float | None
     value: float  # distance, or ratio of the larger to the smaller
     low: float  # of its confidence interval
@@ -82,7 +81,7 @@ class Check:
 
     @classmethod
     def exact(cls, name: str, first: float, second: float, value: float, limit: float) -> Check:
-        """Return whether the check compares counts of the whole run, which are not random."""
+        """Make a check of figures of the whole run that are not random, so without an interval."""
         return cls(name, "whole run", first, second, value, value, value, limit)
 
     @property
@@ -93,7 +92,7 @@ class Check:
 
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict:
-    """Return the verdict of several checks: one that is incomparable decides."""
+    """Return the worst of several verdicts; "comparable" if there are none."""
     return max(verdicts, key=_ORDER.index, default="comparable")
 
 
@@ -101,7 +100,7 @@ def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Che
     """Run all checks. Both feeds must name the same cells in the same order."""
     checks = []
     totals = [_resampled(feed, rng) for feed in (first, second)]
-    # Without importance weights the mix after weights is the mix.
+    # Without importance weights, both mixes are the same.
     weighted = any(not np.array_equal(feed.drawn, feed.weight) for feed in (first, second))
     for kind, name in enumerate(("mix", "mix after weights")[: 1 + weighted]):
         for tenth in (None, *range(10)):
@@ -111,10 +110,10 @@ def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Che
             a, b = (total[:, kind, cells].sum(1) for total in totals)
             fed = a[0].sum() > 0, b[0].sum() > 0
             if not all(fed):
-                if any(fed):  # one arm was not fed at all then
+                if any(fed):  # only one arm was fed in this tenth
                     checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
                 continue
-            with np.errstate(invalid="ignore"):  # a resample without a row: NaN, so inconclusive
+            with np.errstate(invalid="ignore"):  # a resample without rows is NaN: inconclusive
                 a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
             checks.append(_distance(name, part, a, b, limit))
             if tenth is None:
@@ -134,7 +133,10 @@ def _ratios(cells: Sequence[str], name: str, a: F64, b: F64) -> list[Check]:
 
 
 def _unlabelled(first: Feed, second: Feed) -> list[Check]:
-    """Check the share of rows drawn before they had labels: they may be of any condition."""
+    """Check the share of fresh rows drawn before they had labels; any condition may be among them.
+
+    The list is empty if the share is within its limit in both feeds.
+    """
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
     for feed in (first, second):
@@ -170,22 +172,22 @@ def _episodes_a_run(feed: Feed, cell: int) -> float:
 
 
 def _distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check:
-    """Return the total variation distance of mixes (1 + R, C): the figure, then its resamples."""
+    """Check the total variation distance of two mixes (1 + R, C): originals, then resamples."""
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
     low, high, lowest, highest = _interval(values[1:])
-    # Two resamples are further apart than their originals, by noise alone; mirrored about the
-    # figure the interval errs to the other side. The wider of the two at each end says neither
-    # "same" nor "different" for noise.
+    # Resampling adds noise, so two resamples are further apart than their originals. Mirrored about
+    # the figure, the interval errs to the other side. Taking the wider of both at each end avoids
+    # that noise alone leads to "same" or "different".
     low, high = min(lowest, 2 * value - highest), max(high, 2 * value - low)
     return Check(name, part, None, None, value, max(low, 0.0), high, limit)
 
 
 def _ratio(name: str, a: F64, b: F64) -> Check:
-    """Return the larger share over the smaller; a, b (1 + R,) are the figure, then resamples."""
+    """Check the larger share over the smaller; a, b (1 + R,) are originals, then resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
-    logs[np.isnan(logs)] = 0.0  # none in both
+    logs[np.isnan(logs)] = 0.0  # 0 in both
     low, high, lowest, highest = _interval(logs[1:])
     nearest = 0.0 if lowest <= 0 <= highest else min(abs(lowest), abs(highest))
     return Check(
@@ -201,17 +203,17 @@ def _ratio(name: str, a: F64, b: F64) -> Check:
 
 
 def _interval(values: F64) -> tuple[float, float, float, float]:
-    """Return the interval that shows "the same", and the wider one that must hold for "different".
+    """Return the interval that may show "the same", and the wider one that may show "different".
 
-    All checks must pass for the same, but any one of them makes a difference: its interval is
-    widened for their number (Bonferroni), or noise would make one of thirty now and then.
+    Feeds are the same only if all checks pass, but different if a single one fails. So the second
+    interval is widened for the number of checks (Bonferroni); else noise would fail one at times.
     """
     tail = (1 - LIMITS.confidence) / 2
-    # By order, not interpolated: between two infinite ratios there is nothing to interpolate.
+    # Not interpolated, as interpolation between two infinite ratios is NaN.
     low, high = np.quantile(values, [tail, 1 - tail], method="nearest")
     if not np.isfinite(values).all():
         return float(low), float(high), float(values.min()), float(values.max())
-    # So far out there are no resamples to count: the normal's tail.
+    # There are no resamples that far out, so the tail of a normal distribution is used.
     centre, spread = float(values.mean()), float(values.std())
     reach = NormalDist().inv_cdf(1 - tail / _CHECKS) * spread
     return float(low), float(high), centre - reach, centre + reach
@@ -220,7 +222,8 @@ def _interval(values: F64) -> tuple[float, float, float, float]:
 def _resampled(feed: Feed, rng: np.random.Generator) -> F64:
     """Return draws and weights by tenth and cell, (1 + R, 2, 10, C): the originals, then resamples.
 
-    A fresh episode is resampled as a whole: in all tenths and cells that it was drawn in.
+    A fresh episode is resampled as a whole, in all tenths and cells that it was drawn in. Logged
+    rows stay as they are.
     """
     from scipy.sparse import csr_array
 
@@ -241,11 +244,12 @@ def _resampled(feed: Feed, rng: np.random.Generator) -> F64:
     ]
     for start in range(0, LIMITS.resamples, 100):
         stop = min(start + 100, LIMITS.resamples)
-        # Poisson times each: the multinomial's, but for the total, which shares do not have.
+        # Each episode is drawn a Poisson number of times. Unlike multinomial draws, these have no
+        # fixed total, which does not matter for shares.
         times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
         for kind, matrix in enumerate(matrices):
             drawn = (times @ matrix).reshape(-1, 10, cells)
-            # The source's share of the batch is a setting, not random: it is kept.
+            # The share of fresh rows in a batch is a setting and not random, so it is kept.
             was, now = total[kind][:, random].sum(-1), drawn[..., random].sum(-1)
             drawn *= (was / np.maximum(now, 1e-12))[..., None]
             sums[1 + start : 1 + stop, kind][..., random] = drawn[..., random]
@@ -266,15 +270,15 @@ Kind = Literal[
     "free",
 ]
 
-# What each treatment allows to differ, besides what decides nothing.
+# Treatment -> the kinds of settings that may differ; "free" and "software" always may.
 ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
     "algorithm": frozenset({"algorithm"}),
     "target": frozenset({"target"}),
     "mixture": frozenset({"feed", "environment"}),
     "practice": frozenset({"practice"}),
-    "data": frozenset({"feed", "environment", "practice"}),  # all that is learnt from
-    # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
-    # its conditions, the environment steps and the evaluation.
+    "data": frozenset({"feed", "environment", "practice"}),  # all that the policy learns from
+    # Off-policy and policy-gradient methods have no replay in common. So only the twin, its
+    # conditions, the environment steps and the evaluation must be the same.
     "method": frozenset({"algorithm", "target", "feed"}),
 }
 _KINDS: dict[str, Kind] = {
@@ -282,7 +286,7 @@ _KINDS: dict[str, Kind] = {
     "config.device": "free",
     "config.threads": "free",
     "config.record": "free",
-    "config.profile": "free",  # a name or a file: `profile` says what it held
+    "config.profile": "free",  # a name or a file; its content is in `profile`
     "config.target": "target",
     "config.evaluation.off_policy": "free",
     "config.evaluation": "evaluation",
@@ -296,7 +300,7 @@ _KINDS: dict[str, Kind] = {
     "config.env.layouts": "environment",
     "config.env.missions": "practice",
     "config.env.missions_share": "practice",
-    "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
+    "config": "feed",  # replay, schedule, env, epsilon decide which rows are drawn and how often
     "panel.store": "store",
     "panel.store_version": "store",
     "panel.others": "store",
@@ -309,7 +313,7 @@ _KINDS: dict[str, Kind] = {
     "next_value": "algorithm",
     "versions": "software",
 }
-_NO_SETTING = frozenset(  # or it follows from the config
+_NO_SETTING = frozenset(  # keys of config.json that are no settings, or follow from other keys
     {"format", "created_ns", "target", "seeds", "update_path", "profile_toml"}
 )
 
@@ -325,7 +329,7 @@ class Difference:
 
 
 class Arm:
-    """Runs of one method. Raises RunError where they are not, or have not learnt anything."""
+    """Runs of one method. Raises RunError if their settings differ, or one has made no update."""
 
     def __init__(self, name: str, paths: Sequence[Path | str]) -> None:
         self.name = name
@@ -343,11 +347,11 @@ class Arm:
 
     @cached_property
     def totals(self) -> dict[str, float]:
-        """Return the mean environment steps and updates of the arm's runs."""
+        """Return the mean numbers of environment steps and of updates of the arm's runs."""
         for run in self.runs:
             if not run.table("progress").num_rows:
                 raise RunError(
-                    "is missing or has no rows, so the length of the run is not known",
+                    "is missing or has no rows, so the length of the run is unknown",
                     where=str(run.path / "progress.parquet"),
                     remedy="restore the file from a copy, or train the run again",
                 )
@@ -360,7 +364,7 @@ class Arm:
         }
 
     def fed(self) -> pa.Table:
-        """Return draws by run, cell, tenth and episode."""
+        """Return draws by run, cell, tenth and episode (`fed_mix.sql`)."""
         query = files("restock.train.judge").joinpath("fed_mix.sql").read_text(encoding="utf-8")
         parts = []
         with duckdb.connect() as connection:
@@ -373,11 +377,11 @@ class Arm:
 
 
 def refuse_dependent(runs: Sequence[Run]) -> None:
-    """Refuse runs of one method that are not independent seeds: their spread would be too small.
+    """Refuse runs that are not independent seeds of one method: their spread would be too small.
 
     Raises:
-        RunError: there is none, two are one run (or copies of it) or have one seed, or their
-            settings differ.
+        RunError: there are no runs, their settings differ, or two runs are the same run, copies of
+            it, or have the same seed.
     """
     if not runs:
         raise RunError("no run was given", remedy="give at least one of each method")
@@ -394,8 +398,8 @@ def refuse_dependent(runs: Sequence[Run]) -> None:
                 f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one method "
                 "may differ only in their seed",
                 where=str(run.path),
-                remedy="give runs of one method; `restock compare` takes those of another one "
-                "after --against",
+                remedy="give runs of one method; `restock compare` takes the runs of another "
+                "method after --against",
             )
         seed = run.document["config"].get("seed")
         other = by_seed.setdefault(seed, run)
@@ -413,12 +417,12 @@ def refuse_dependent(runs: Sequence[Run]) -> None:
 
 
 def same_run(first: Run, second: Run) -> bool:
-    """Return whether two directories hold one run: a copy has its time of creation and settings."""
+    """Return whether two directories hold the same run: a copy has an equal config.json."""
     return first.document == second.document
 
 
 def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
-    """Return what two arms were fed, over the cells of both."""
+    """Return what each of two arms was fed; both feeds have the cells of either."""
     tables = first.fed(), second.fed()
     cells = sorted({name for table in tables for name in table["cell"].unique().to_pylist()})
     a, b = (_feed(table, cells) for table in tables)
@@ -429,7 +433,7 @@ def _feed(table: pa.Table, cells: list[str]) -> Feed:
     run = np.asarray(table["run"], np.int64)
     names = table["episode"].to_numpy(zero_copy_only=False).astype(str)
     fresh = np.asarray(table["source"].to_numpy(zero_copy_only=False) == "fresh")
-    # Every run has its own fresh episode 7; an episode of the logs is the same one in all runs.
+    # Fresh episode 7 of one run is not that of another run; logged episodes are the same in all.
     owner = np.where(fresh, run, -1)
     _, episode = np.unique(
         np.char.add(np.char.add(owner.astype(str), "/"), names), return_inverse=True
@@ -452,16 +456,16 @@ def _feed(table: pa.Table, cells: list[str]) -> Feed:
 
 
 def differences(first: Run, second: Run) -> list[Difference]:
-    """Return the settings in which two runs differ, each with what kind of difference it is."""
+    """Return the settings in which two runs differ, each with the kind of difference."""
     a, b = _settings(first), _settings(second)
     if a.get("panel.id") is None or b.get("panel.id") is None:
-        # One was fed no logs at all: that is one difference of the feed, not one of the store.
+        # If one run was fed no logs, that is a single difference of the feed, not of the store.
         for settings in (a, b):
             has = settings.get("panel.id") is not None
             for name in [name for name in settings if name.split(".")[0] == "panel"]:
                 if not (name == "panel.id" and has):
                     del settings[name]
-    for settings in (a, b):  # what the natural rule does not read makes no difference
+    for settings in (a, b):  # the natural rule ignores the other settings of practice
         if settings.setdefault("config.practice.rule", "natural") == "natural":
             for name in [n for n in settings if n.startswith("config.practice.")]:
                 settings[name] = "natural" if name.endswith(".rule") else None
@@ -473,9 +477,10 @@ def differences(first: Run, second: Run) -> list[Difference]:
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """Return what `config.json` says of a run, by dotted name.
+    """Return a run's settings in `config.json`, by dotted name.
 
-    Shares of strata are left out: `panel.id` stands for them, and two of one name are not the same.
+    Shares of strata are left out: `panel.id` covers them, and strata of two mixtures may have the
+    same name and different rows.
     """
     document = run.document
     settings = by_path({key: document[key] for key in document if key not in _NO_SETTING})
@@ -484,7 +489,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def kind_of(setting: str) -> Kind:
-    """Return what kind of difference a setting makes; the longest known prefix decides."""
+    """Return the kind of a setting, by its longest prefix in `_KINDS`; "algorithm" without one."""
     parts = setting.split(".")
     for length in range(len(parts), 0, -1):
         if (kind := _KINDS.get(".".join(parts[:length]))) is not None:

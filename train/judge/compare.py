@@ -1,13 +1,13 @@
 """Check whether two arms may be compared, then compare their outcomes.
 
-A comparison of methods that were fed differently measures the feed. It is refused, with what
-differs, unless the feed is what is compared (`treatment="mixture"`).
+A comparison of methods that were fed differently measures the feed. It is refused, with a list of
+the differences, unless the treatment allows them (`treatment="mixture"`).
 
 Outcomes are differences with intervals, paired by episode: Student's t over runs (seeds) and
-episodes, so that an interval holds both what another seed and what other episodes would have
-changed. From fewer than `MIN_RUNS` runs an arm or `MIN_EPISODES` episodes there is none, nor
-where every run ended every episode alike: only values. The
-probability of improvement and the interquartile mean are those of arXiv:2108.13264.
+episodes, so that an interval covers both other seeds and other episodes. There is no interval with
+fewer than `MIN_RUNS` runs per arm or `MIN_EPISODES` episodes, nor if every run ended every episode
+in the same way. The probability of improvement and the interquartile mean are those of
+arXiv:2108.13264.
 """
 
 from __future__ import annotations
@@ -54,43 +54,43 @@ from restock.train.judge.comparability import (
 )
 from restock.train.run.run import Run
 
-_SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
-MIN_RUNS = 3  # seeds of each arm: with fewer there is no interval
+_SAME_TOTAL = 1.02  # largest ratio of environment steps, and of updates
+MIN_RUNS = 3  # seeds per arm; with fewer there is no interval
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The verdict of the checks, and the outcomes where the arms are comparable."""
+    """The verdict of the checks, and the outcomes if the arms are comparable."""
 
     treatment: Treatment
     verdict: Verdict
     differences: list[Difference]  # of settings
-    refused: list[Difference]  # those that the treatment does not allow
-    totals: list[Check]  # environment steps and updates
+    refused: list[Difference]  # differences that the treatment does not allow
+    totals: list[Check]  # of environment steps and updates
     checks: list[Check]  # of the feed
-    source: str | None  # of the outcomes: restock eval, or the training's own evaluations
-    rows: list[dict[str, Any]]
+    source: str | None  # of the outcomes: "restock eval" or "training"; None without outcomes
+    rows: list[dict[str, Any]]  # the outcomes, one per perturbation and condition
 
     @property
     def deciding_checks(self) -> list[Check]:
-        """Return the checks that decide: those of the feed too, unless it is the treatment."""
+        """Return the checks that decide the verdict; the treatment excludes some of the feed."""
         return _deciding(self.treatment, self.totals, self.checks)
 
     @property
     def why(self) -> str:
-        """Say why the comparison is refused; "" if it is not."""
+        """Explain why the comparison is refused; "" if it is not."""
         if self.verdict == "comparable":
             return ""
         if self.refused:
             names = ", ".join(difference.setting for difference in self.refused)
             return f"the runs differ in {names}, which treatment {self.treatment} does not allow"
         failed = [check for check in self.deciding_checks if check.verdict == self.verdict]
-        # Different numbers of updates make the feeds differ: name that one cause.
+        # Different numbers of updates make the feeds differ, too: name only the cause.
         for check in failed:
             if check.name == "updates" and None not in (check.first, check.second):
                 return (
                     f"the first made {check.first:,.0f} updates and the second {check.second:,.0f},"
-                    " with those on the logs alone (schedule.updates_per_env_step); treatment"
+                    " including those on the logs alone (schedule.updates_per_env_step); treatment"
                     " method allows that"
                 )
         names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
@@ -101,7 +101,7 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """Say what the checks came to."""
+        """Return the result of the checks as a sentence."""
         if self.verdict != "comparable":
             undecided = ", inconclusive" if self.verdict == "inconclusive" else ""
             return f"REFUSED{undecided}: {self.why}"
@@ -140,9 +140,9 @@ def compare(
     """Compare the runs of two arms.
 
     Raises:
-        RunError: a run is missing, has no updates, or does not belong to its arm; two of an arm
-            are one run or have one seed; an arm has no run; or a run is in both arms. Also an
-            unknown treatment.
+        RunError: a run is missing, has no updates, has other settings than its arm, or is in both
+            arms; an arm has no run, the same run twice, or two runs of one seed; or the treatment
+            is unknown.
     """
     if treatment not in ALLOWED:
         what = f"there is no treatment {treatment!r}"
@@ -173,9 +173,9 @@ def _refuse_shared(first: Arm, second: Arm) -> None:
 
 
 def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
-    if treatment == "method":  # an update of one method is not one of another
+    if treatment == "method":  # updates of different methods cannot be compared
         return [check for check in totals if check.name == "env steps"]
-    if treatment == "practice":  # fresh rows are of what was practised; the logs' must be the same
+    if treatment == "practice":  # practice changes the fresh rows; logged rows must be the same
         return totals + [check for check in checks if " logs/" in check.name]
     return totals + ([] if treatment in ("mixture", "data") else checks)
 
@@ -187,7 +187,9 @@ def _total(name: str, first: float, second: float) -> Check:
 
 
 def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
-    """Return the episodes' origin, and a row per perturbation and condition that both arms drove.
+    """Return the source of the episodes, and an outcome per cell that both arms drove.
+
+    A cell is a perturbation and a condition.
 
     Raises:
         RunError: a run has no evaluation, or the arms share no episode.
@@ -216,7 +218,7 @@ def _outcome(
 ) -> dict[str, Any]:
     difference = difference_of_arms(a[..., 0], b[..., 0]).within(-1.0, 1.0)
     missing = _why_no_interval(a, b, difference)
-    # Episode by episode, over all pairs of runs.
+    # Compares each episode over all pairs of runs.
     better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
     few = min(len(a), len(b)) < MIN_RUNS or a.shape[1] < MIN_EPISODES
     return {
@@ -242,7 +244,7 @@ def _known(value: float) -> float | None:
 
 
 def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
-    """Return why an interval would claim too much, or None; a, b as in `_outcome`."""
+    """Explain why an interval would claim too much; None if it would not. a, b as in `_outcome`."""
     if np.isnan(difference.value):
         return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
@@ -256,7 +258,7 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
 
 
 def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[Key, F64]]:
-    """Return success and return (runs, 2) by cell, of the episodes that every run drove."""
+    """Return success and return (runs, 2) by cell and episode, if every run drove the episode."""
     first, *others = runs = [by_cell(table) for table in tables]
     return {
         cell: {
@@ -269,7 +271,9 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[Key, F64]]:
 
 
 def _episodes(runs: Sequence[Run]) -> tuple[str, list[pa.Table]]:
-    """Return the origin of the episodes that each run's policy drove, and these episodes.
+    """Return the source of the episodes that each run's policy drove, and their tables.
+
+    They come from `restock eval` if all runs have such episodes, else from the training.
 
     Raises:
         RunError: a run has no evaluation.
@@ -294,16 +298,16 @@ def last_evaluation(run: Run) -> pa.Table:
 
 
 def diff_runs(a: Run, b: Run) -> dict[str, Any]:
-    """Return the settings and rows that differ in `b`, and the episodes that both drove.
+    """Compare two runs' settings, panels, and outcomes of the episodes that both drove.
 
     Raises:
-        RunError: they are of different tasks.
+        RunError: the runs are of different tasks.
     """
     tasks = [str(run.document.get("task_hash")) for run in (a, b)]
     if tasks[0] != tasks[1]:
         raise RunError(
-            f"was trained on task {tasks[1]}, {a.path} on {tasks[0]}: their returns and episodes "
-            "have different meanings",
+            f"was trained on task {tasks[1]}, but {a.path} on {tasks[0]}: their returns and "
+            "episodes have different meanings",
             where=str(b.path),
             remedy="compare runs of one profile (`profile` in their configs)",
         )
@@ -319,7 +323,10 @@ def diff_runs(a: Run, b: Run) -> dict[str, Any]:
 
 
 def _panels(a: Run, b: Run) -> dict[str, Any] | None:
-    """Return what differs between their panels, if both still exist."""
+    """Compare the runs' panels; None if they are the same or a run has none.
+
+    If a panel cannot be opened or was replaced, only a note about that is returned.
+    """
     fed = [run.document.get("panel") or {} for run in (a, b)]
     if not all(fed) or fed[0].get("id") == fed[1].get("id"):
         return None

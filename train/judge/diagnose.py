@@ -1,14 +1,15 @@
 """Tell buffer failure from target failure: what a critic gets wrong, and where.
 
-A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
-or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
-its *target* may follow too slowly, not at all, or too fast: then it is wrong everywhere, or its two
-networks disagree. Steps of the evaluations, in no replay, tell which: `windows` has the figures and
-their limits. Each figure is its median over the last evaluations.
+A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may have too few or
+too many rows of a condition, or wrong ones: then it is wrong on fresh steps of that condition and
+right elsewhere. Or its *target* may follow too slowly, not at all, or too fast: then it is wrong
+everywhere, or its two networks disagree. The evaluations' steps, which are not in replay, show
+which: `windows` has the figures and their limits. Each figure is the median over the last
+evaluations.
 
 An experiment confirms a diagnosis: the same run with one suspect replaced. If the target was at
-fault, another target rule on the same feed repairs it; if the feed was, the same target rule on
-another feed does. What stays the same is evidence, too.
+fault, another target rule on the same feed repairs the critic. If the feed was, the same target
+rule on another feed does.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.floors.layout import DEFAULT
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
-WINDOWS = 3  # the last, that figures are the median of
-_SETTLED_LAGS = 10  # updates, in mean ages of the target: then even a young critic's L is low
-_MIN_UPDATES = 1500  # of a slower rule: no excuse, unless L is falling
-_FALLING = 0.75  # the last L over the first of the last windows
-_WORKING_LAGS = 50, 800  # updates: the mean age of a target that most critics can learn from
+WINDOWS = 3  # figures are medians over this many last windows
+_SETTLED_LAGS = 10  # mean ages of the target after which even a young critic's L is low
+_MIN_UPDATES = 1500  # from here on L is judged even if the rule is slower, unless L is falling
+_FALLING = 0.75  # the last L over the first of the last windows; below it, L is falling
+_WORKING_LAGS = 50, 800  # mean ages of a target, in updates, from which most critics can learn
 
 
 @dataclass(frozen=True)
@@ -59,19 +60,19 @@ class Diagnosis:
     """The verdict on one or more runs (seeds of one method), with the evidence."""
 
     cause: Cause
-    runs: list[Cause]  # each run's own
-    figures: list[Window]  # each run's, over its last windows
-    windows: list[list[Window]]  # each run's, in time
+    runs: list[Cause]  # per run
+    figures: list[Window]  # per run, the median over its last windows
+    windows: list[list[Window]]  # per run, in order of time
     evidence: list[str]
-    experiment: str  # what would confirm it
+    experiment: str  # that would confirm the cause
 
 
 def diagnose(runs: Sequence[Run]) -> Diagnosis:
-    """Diagnose runs of one method, which differ in their seed.
+    """Diagnose runs of one method that differ only in their seed.
 
     Raises:
-        RunError: no run is given, a run has no evaluation after its updates; or two of them are
-            one run, have one seed or differ in more than it.
+        RunError: no run is given, a run has no evaluation after its updates, or two runs are the
+            same run, have the same seed, or differ in more than the seed.
     """
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
@@ -95,7 +96,7 @@ def diagnose(runs: Sequence[Run]) -> Diagnosis:
 
 
 def target_rule(run: Run) -> TargetRule:
-    """Return the rule that the run's target followed; raise RunError if it does not say."""
+    """Return the run's target rule; raise RunError if its config has none."""
     if (given := run.document["config"].get("target")) is None:
         raise RunError(
             "does not say how its target follows",
@@ -107,9 +108,9 @@ def target_rule(run: Run) -> TargetRule:
 
 
 def other_target(rule: TargetRule) -> Polyak:
-    """Return a target rule that tells whether `rule` is at fault.
+    """Return a target rule to try in place of `rule`, to test whether that is at fault.
 
-    That is the default rule if `rule` is far too slow or too fast, else one with a quarter of its
+    It is the default rule if `rule` is far too slow or too fast, else one with a quarter of its
     lag.
     """
     least, below = _WORKING_LAGS
@@ -144,10 +145,10 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
 
 
 def _too_young(last: Sequence[Window], rule: TargetRule) -> str:
-    """Return why an L past its limit may come from the run's age; "" if it does not.
+    """Explain why the run may be too young to judge an L past its limit; "" if it is not.
 
-    While values grow from 0, every target lags. If a rule is so slow that no run would be old
-    enough, the rule is at fault: its L does not fall.
+    While values grow from 0, every target lags. But if a rule is so slow that no run would be old
+    enough, L does not fall, and the rule is at fault.
     """
     updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
     if updates >= settled:
@@ -168,7 +169,7 @@ def _explained(explained: float | None) -> str:
 
 
 def _evidence(window: Window) -> list[str]:
-    """Describe a window in sentences."""
+    """Describe a window's figures, and which of them are past their limits."""
     most = f"of at most {window.q_bound:.3g}"
     if isinf(window.q_bound):
         most = "(how large it may be is unknown: no audited row has a reward)"
@@ -187,7 +188,7 @@ def _experiment(
     cause: Cause,
     windows: Sequence[Window],
     rule: TargetRule,
-    advice: str,  # where it is UNDETERMINED
+    advice: str,  # if the cause is UNDETERMINED
 ) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad())
     which = ", ".join(named) or "the condition with the largest gap"
@@ -205,7 +206,7 @@ def _experiment(
     }[cause]
 
 
-_TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too
+_TOGETHER: dict[Cause, Cause] = {  # cause by a run's figures -> cause if its rows are wrong, too
     "HEALTHY": "BUFFER",
     "UNDETERMINED": "BUFFER",
     "TARGET": "BOTH",
@@ -213,7 +214,7 @@ _TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too
 
 
 def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
-    """Return the diagnosis of the panel that the runs were fed, or None and why there is none."""
+    """Diagnose the rows of the panel that the runs were fed; None, and why, if impossible."""
     fed = {run.document["panel"]["path"]: run for run in runs if run.document.get("panel")}
     if len(fed) != 1:
         return None, "the runs were fed several panels" if fed else "there is no panel"
@@ -231,7 +232,7 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
             layouts=env.get("layouts", DEFAULT),
         )
         return found, ""
-    except RestockError as error:  # a run may be read where its panel is not
+    except RestockError as error:  # the run may be on a machine without its panel
         return None, f"{path}: {error.what}"
 
 
@@ -271,18 +272,18 @@ def check_place(out: Path) -> None:
 def confirm(
     run: Run, diagnosis: Diagnosis, out: Path, *, rows_at_fault: bool = False
 ) -> dict[str, Any]:
-    """Train again into `out` with one thing swapped, and diagnose that run.
+    """Train again into `out` with the suspected part replaced, and diagnose that run.
 
-    `diagnosis` is of the run's own figures (`diagnose`), without its rows: rows that are wrong
-    alike leave no trace in any run's figures, so that a new run without such a trace would confirm
-    nothing. `rows_at_fault` says that the rows are, for a run whose figures are not.
+    `diagnosis` must be that of `diagnose`, without `with_rows`: consistently wrong rows leave no
+    trace in any run's figures, so a new run without a trace would confirm nothing. `rows_at_fault`
+    is whether the rows were found to be wrong; it only makes the error more precise.
 
-    Returns `changed` (settings), the new run's `cause`, and `confirmed`: True where the cause is
-    gone, False where it stayed, None where the new run does not say.
+    Returns `changed` (settings), the `run`, its `cause` and `evidence`, and `confirmed`: True if
+    the suspected cause is gone, False if it is not, None if the new run is undetermined.
 
     Raises:
-        RunError: something is at `out`, there is nothing to confirm, or no setting changes what
-            is suspected.
+        RunError: something is at `out`, there is nothing to confirm, or the run already has the
+            settings of the experiment.
     """
     check_place(out)
     config, where = run.document["config"], str(run.path)
@@ -297,11 +298,11 @@ def confirm(
     elif parse_config(apply_overrides(config, changed), where=where) == parse_config(
         config, where=where
     ):
-        what = f"it has the settings of the experiment already: {', '.join(changed)}"
+        what = f"it already has the settings of the experiment: {', '.join(changed)}"
     if what is not None:
         raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
     panel = run.document["panel"]
-    given = config["teacher"]  # resolved, with settings that its source does not have
+    given = config["teacher"]  # resolved; includes settings that have no effect with its source
     resolved = parse_config(config, where=where)
     has = {"source", *(key for key in given if has_effect(resolved, key))}
     taught = {key: value for key, value in given.items() if key in has}
@@ -313,7 +314,7 @@ def confirm(
     finally:
         session.close()
     after = diagnose([Run.open(out)])
-    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # what was swapped
+    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # what was replaced
     still = after.cause in (suspected, "BOTH")
     return {
         "changed": changed,
@@ -325,14 +326,14 @@ def confirm(
 
 
 def swapped(run: Run, cause: Cause) -> list[str]:
-    """Return the settings that replace what is suspected."""
+    """Return the settings that replace the suspected part."""
     config = run.document["config"]
     if cause == "DIVERGENCE":
         return [f"optimizer.learning_rate={min(config['optimizer']['learning_rate'] / 10, 3e-4)}"]
     if cause in ("TARGET", "BOTH"):
         tau = other_target(target_rule(run)).tau
         return [f"target={{rule='polyak', tau={tau:g}}}"]
-    # The feed: all conditions that were evaluated, equally often, and fresh rows alone.
+    # Another feed: only fresh rows, of all evaluated conditions equally often.
     share = 1 / len(config["env"]["conditions"])
     names = list(config["env"]["conditions"])
     natural = "practice={rule='natural'}"

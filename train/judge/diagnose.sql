@@ -1,10 +1,10 @@
--- What a diagnosis looks at: one row an evaluation (a window) and condition. run_evaluation_buffer,
+-- Figures for a diagnosis, one row per evaluation (window) and condition. run_evaluation_buffer,
 -- run_conditions and run_progress are the run's tables.
 WITH windows AS (
     SELECT gradient_steps AS until,
            coalesce(lag(gradient_steps) OVER (ORDER BY gradient_steps), 0) AS since
     FROM (SELECT DISTINCT gradient_steps FROM run_evaluation_buffer)
-), replay AS (  -- of the same condition, logged and fresh together, in the window before
+), replay AS (  -- draws by condition, logged and fresh together, since the evaluation before
     SELECT until, condition, sum(drawn_rows) AS replay_rows,
            sum(td_abs_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS replay_td
     FROM run_conditions

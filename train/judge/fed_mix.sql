@@ -1,5 +1,6 @@
--- What one run's critic was fed, by episode, cell (source/condition) and tenth of its training. `fed`
--- is the run's sampled_episodes. Strata have names of their mixture: those of two runs may differ.
+-- What one run's critic was fed, by episode, cell (source/condition) and tenth of its training.
+-- `fed` is the run's sampled_episodes. Strata are not used: two runs' mixtures may name them
+-- differently.
 WITH drawn AS (
     SELECT *, max(gradient_steps) OVER () AS whole FROM fed
 )

@@ -1,8 +1,8 @@
 """Rows that a critic is fed, from a panel, a store or the twin, in one form.
 
-Rows lie in the order in which they were driven, episode by episode, so that a row's predecessors
-are those before it. What is compared later is compared in these terms alone: observations,
-actions, rewards and ends, by the task's own names. So a panel can be judged whose store is gone.
+Rows are sorted by episode and step, so that a row's predecessor stands before it. Most checks use
+only observations, actions, rewards and ends of episodes, by the task's names. So a panel can be
+judged even if its store no longer exists.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.perturbation import Perturbation
 
 Status = Literal["ok", "off", "undecided", "not run"]
-TAIL = 0.025  # of a 95 % interval
+TAIL = 0.025  # one tail of a 95 % interval
 
 
 @dataclass
 class Comparison:
-    """The result of a check: `effect` is a ratio or a difference, as `measure` says.
+    """The result of a check: a figure, its 95 % interval and the range that is allowed.
 
-    `status` is by whether its 95 % interval lies within the allowed range, across its end, or
-    beyond it.
+    `status` is "ok" if `effect` is in the allowed range, "off" if the whole interval is outside,
+    "undecided" if the interval reaches into the range.
     """
 
-    check: str  # a name that causes and docs know it by
-    what: str  # for people
+    check: str  # its name in `causes.toml` and the docs
+    what: str  # what was compared, for people
     measure: str  # of `effect`: "ratio", "difference", "share", …
     status: Status
     logs: float | None = None
@@ -55,12 +55,12 @@ class Comparison:
     effect: float | None = None
     low: float | None = None
     high: float | None = None
-    least: float | None = None  # allowed
-    most: float | None = None
+    least: float | None = None  # lower end of the allowed range
+    most: float | None = None  # its upper end
     logs_rows: int = 0
     twin_rows: int = 0
     note: str = ""
-    p: float = 1.0  # one-sided, of a value this far beyond the allowed range
+    p: float = 1.0  # one-sided p-value of a value this far outside the allowed range
 
     @property
     def off(self) -> bool:
@@ -68,7 +68,7 @@ class Comparison:
 
     @property
     def suspicious(self) -> bool:
-        """Return whether it is undecided with an interval that excludes "no effect"."""
+        """Return whether the check is undecided but its interval excludes "no effect"."""
         neutral = 1.0 if self.measure == "ratio" else 0.0
         if self.status != "undecided" or self.low is None or self.high is None:
             return False
@@ -80,10 +80,7 @@ def judged(
     logs: float | None, twin: float | None, least: float = -math.inf, most: float = math.inf,
     logs_rows: int, twin_rows: int = 0, note: str = "",
 ) -> Comparison:  # fmt: skip
-    """Judge a comparison by its interval.
-
-    It is off if all of the interval is beyond the allowed range, undecided if the value alone is.
-    """
+    """Judge a figure by its interval; the check was not run if the figure is not finite."""
     if not math.isfinite(interval.value):
         return not_run(check, what, note or "too few rows")
     within = least <= interval.value <= most
@@ -98,7 +95,7 @@ def judged(
 
 
 def _beyond(interval: ConfidenceInterval, least: float, most: float) -> float:
-    """Return the one-sided p of the nearest allowed value, by the interval's width."""
+    """Return the one-sided p-value of the nearest allowed value, from the interval's width."""
     value = interval.value
     if value > most:
         by, half = value - most, value - interval.low
@@ -111,9 +108,9 @@ def _beyond(interval: ConfidenceInterval, least: float, most: float) -> float:
 
 
 def correct_over_parts(parts: Sequence[Sequence[Comparison]]) -> None:
-    """Correct each check for the number of parts (robots, recordings) that it is made in.
+    """Correct each check for the number of parts (robots, recordings) in which it was made.
 
-    By Holm's method: the chance that a check is off in any part of sound logs is that of one test.
+    With Holm's method, a check is as likely to be off in any part of sound logs as a single test.
     """
     by_check: dict[str, list[Comparison]] = {}
     for row in chain.from_iterable(parts):
@@ -125,14 +122,14 @@ def correct_over_parts(parts: Sequence[Sequence[Comparison]]) -> None:
 
 
 def not_run(check: str, what: str, reason: str) -> Comparison:
-    """Return a check that could not be made, with the reason."""
+    """Return the result of a check that could not run, with the reason."""
     return Comparison(check, what, "", "not run", note=reason)
 
 
 def share_judged(
     check: str, what: str, found: int, of: int, most: float, *, least: float = 0.0, note: str = ""
 ) -> Comparison:
-    """Judge a share of the logs' rows against a limit known by definition."""
+    """Judge a share of the logs' rows, `found` of `of`, against fixed limits."""
     if not of:
         return not_run(check, what, note or "no such rows")
     interval = ConfidenceInterval(found / of, *wilson(found, of))
@@ -149,7 +146,7 @@ def shares_compared(
 ) -> Comparison:  # fmt: skip
     """Judge the difference of two shares, each (found, of), by Newcombe's interval."""
     if not logs[1] or not twin[1]:
-        return not_run(check, what, "no such rows in the logs" if twin[1] else "nor in the twin")
+        return not_run(check, what, "no such rows in the " + ("logs" if twin[1] else "twin"))
     (p, q), ((a, b), (c, d)) = (
         (logs[0] / logs[1], twin[0] / twin[1]),
         (wilson(*logs), wilson(*twin)),
@@ -164,23 +161,23 @@ def shares_compared(
 
 
 def unflagged(check: str, what: str, reason: str) -> Flags:
-    """Return a check of rows that could not be made of any, with the reason."""
+    """Return a check of single rows that could not run on any row, with the reason."""
     return Flags(check, what, np.zeros(0, np.int64), np.zeros(0, np.bool_), 0.0, reason)
 
 
 @dataclass(frozen=True)
 class Flags:
-    """A check of rows one by one: which of those that it looks at are off."""
+    """A check of single rows: the M rows that it checked, and which of these are off."""
 
     check: str
     what: str
     transition_id: Ints  # (M,)
     off: Bools  # (M,)
-    most: float
+    most: float  # largest share of rows that may be off
     note: str = ""
 
     def of(self, rows: FedRows) -> Comparison:
-        """Judge the share of these rows that is off."""
+        """Judge the share that is off, of those of these rows that were checked."""
         inside = np.isin(self.transition_id, rows.transition_id)
         found = int(self.off[inside].sum())
         return share_judged(
@@ -193,9 +190,9 @@ _COLUMNS = (
     *("condition", "action", "reward", "terminated", "truncated", "observation"),
     "next_observation",
 )
-FEW_EPISODES = 20  # fewer than these are drawn in stretches of
-BLOCK_STEPS = 50  # steps: longer than what a step still shows of those before it
-MAX_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
+FEW_EPISODES = 20  # with fewer, a bootstrap draws stretches of `BLOCK_STEPS` in place of episodes
+BLOCK_STEPS = 50  # more steps than a step is correlated with
+MAX_ROWS = 40_000  # that are read of a store or panel, in whole episodes from a fixed shuffle
 
 
 @dataclass(frozen=True)
@@ -204,25 +201,25 @@ class FedRows:
 
     task: Task
     observation: F32  # (N, D)
-    next_observation: F32  # (N, D) at t + 1, whatever n the returns of a panel have
+    next_observation: F32  # (N, D) at t + 1, also if a panel has n-step returns
     action: Ints  # (N,)
     reward: F64  # (N,) of one step
     terminated: Bools  # (N,)
     truncated: Bools  # (N,)
-    episode: Ints  # (N,) codes, rising
+    episode: Ints  # (N,) codes, ascending
     step: Ints  # (N,) in its episode
     recording: NDArray[np.str_]  # (N,)
-    robot: NDArray[np.str_]  # (N,) as the recording is tagged; "" where it is not
+    robot: NDArray[np.str_]  # (N,) the recording's tag; "" if it has none
     logged_ns: Ints  # (N,)
     condition: NDArray[np.str_]  # (N,)
     transition_id: Ints  # (N,)
-    # Of a store, if it is at hand:
+    # Only if the rows' store is there:
     pose: F64 | None = None  # (N, 3) on the map: x and y in m, heading in rad
-    success: F64 | None = None  # (N,) of the row's episode; NaN is unknown
+    success: F64 | None = None  # (N,) of the row's episode; NaN if unknown
     held: NDArray[np.object_] | None = None  # (N,) lists of conditions and exposures
-    driver: NDArray[np.str_] | None = None  # (N,) who acted; "" is unknown
-    counted: Ints | None = None  # (N, 2) rows that were written of its recording, and that are held
-    left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
+    driver: NDArray[np.str_] | None = None  # (N,) behaviour policy; "" if unknown
+    counted: Ints | None = None  # (N, 2) rows of its recording: written at ingest, still stored
+    left_out: dict[str, int] = field(default_factory=dict)  # reason -> rows that were left out
 
     def __len__(self) -> int:
         return len(self.action)
@@ -245,7 +242,7 @@ class FedRows:
 
     @cached_property
     def cluster(self) -> Ints:
-        """Return codes (N,) of a bootstrap's units: episodes, or stretches if there are few."""
+        """Return the codes (N,) of what a bootstrap draws: episodes, or stretches of a few."""
         if len(np.unique(self.episode)) >= FEW_EPISODES:
             return self.episode
         stretch = self.step // BLOCK_STEPS
@@ -263,7 +260,10 @@ class FedRows:
         return np.asarray(np.cumsum(~self.joined), np.int64)
 
     def before(self, lag: int) -> tuple[Ints, Bools]:
-        """Return the row (N,) `lag` steps before each (after, if negative), and if it exists."""
+        """Return the index (N,) of the row `lag` steps earlier, and whether there is one (N,).
+
+        A negative lag means later rows.
+        """
         place = np.arange(len(self)) - lag
         inside = np.clip(place, 0, max(len(self) - 1, 0))
         known = (place == inside) & (self._stretch[inside] == self._stretch)
@@ -278,11 +278,11 @@ class FedRows:
         return self._column(self.next_observation, name)
 
     def sectors(self, *, after: bool = False) -> F64:
-        """Return the clearance entries (N, sectors), in [0, 1], by rising bearing."""
+        """Return the clearance entries (N, sectors), in [0, 1], by ascending bearing."""
         return nearness_of(self.task, self.next_observation if after else self.observation)
 
     def previous_action(self, *, after: bool = False) -> Ints:
-        """Return the action before t (N,), or before t + 1, that the observations hold."""
+        """Return the previous action that the observations at t, or t + 1, contain, (N,)."""
         first = self.task.observation_names.index("previous_action_0")
         rows = self.next_observation if after else self.observation
         held = rows[:, first : first + len(self.task.actions)]
@@ -297,13 +297,13 @@ class FedRows:
 
 
 def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
-    """Return the rows of a panel.
+    """Return the rows of a panel, at most about `most`.
 
-    Rows whose next step is not in the panel are left out if its returns are of several steps, and
-    counted.
+    A row with an n-step return gets its next observation from the following row. It is left out,
+    and counted, if the panel does not have that row.
 
     Raises:
-        PanelError: the task does not have a row's action.
+        PanelError: a row's action is not among the task's.
     """
     meta = panel.meta
     order = _by_step(meta)
@@ -324,10 +324,10 @@ def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
 
 
 def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
-    """Return the rows of a task of a store.
+    """Return a store's rows of one task, at most about `most`.
 
     Raises:
-        StoreError: it has none, or the task does not have a row's action.
+        StoreError: there are none, or a row's action is not among the task's.
     """
     counted = store.connection.sql(
         "SELECT episode_id, count(*) AS rows FROM transitions WHERE task_hash = ?"
@@ -386,11 +386,11 @@ def _by_step(table: pa.Table) -> Ints:
 
 
 def _not_looked_at(rows: int) -> dict[str, int]:
-    return {"more than are checked, in whole episodes": rows} if rows else {}
+    return {"in episodes beyond the limit of rows to check": rows} if rows else {}
 
 
 def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
-    """Return the columns that a store and a panel's `meta` share, in the form of `FedRows`."""
+    """Return the fields of `FedRows` that a store's rows and a panel's `meta` both have."""
     episode = np.unique(_text(table, "episode_id")[order], return_inverse=True)[1].reshape(-1)
     kinds: dict[str, Any] = {"action": np.int64, "reward": np.float64, "transition_id": np.int64}
     kinds |= {"terminated": np.bool_, "truncated": np.bool_, "logged_ns": np.int64}
@@ -400,19 +400,19 @@ def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
         "step": _numbers(table, "step_index")[order].astype(np.int64),
         "recording": _text(table, "recording_id")[order],
         "robot": _text(table, "robot")[order]
-        if "robot" in table.column_names  # panels of an older Restock have none
+        if "robot" in table.column_names  # panels made by an older Restock lack it
         else np.full(len(order), ""),
         "condition": _text(table, "condition")[order],
     }
 
 
 def _one_step(rows: FedRows, far: Bools) -> FedRows:
-    """Return one-step next observations from the row after, if a panel's span several steps."""
+    """Replace next observations that are several steps ahead (`far`) by those of the next step."""
     following, known = rows.before(-1)
     after = rows.next_observation.copy()
     after[far & known] = rows.observation[following[far & known]]
     lost = far & ~known
-    left = {"the step after is not in the panel": int(lost.sum())}
+    left = {"the next step is not in the panel": int(lost.sum())}
     return replace(rows, next_observation=after).take(~lost, **left)
 
 
@@ -431,8 +431,8 @@ def _vectors(column: pa.ChunkedArray, size: int) -> F32:
     return np.ascontiguousarray(flat, np.float32).reshape(-1, size)
 
 
-ROBOTS, STEPS = 24, 400  # that drive in the twin, and the steps of each
-EXPLORATION = 0.1  # of their drivers
+ROBOTS, STEPS = 24, 400  # robots in the twin, and steps of each
+EXPLORATION = 0.1  # exploration rate of their drivers
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 _SIGNALS = tuple(signal.name for signal in STORED_SIGNALS)
 
@@ -450,7 +450,7 @@ def drive_twin(
 ) -> FedRows:
     """Drive the twin, and return the rows of episodes that ended within `steps` steps per robot.
 
-    `conditions` are those that the twin's signals can say.
+    `conditions` must be computable from the twin's signals.
 
     Raises:
         ConfigError: the twin cannot keep the task's control period, or has no such body.
@@ -490,11 +490,14 @@ def drive_twin(
 def _ended(
     task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
 ) -> FedRows:
-    """Return the rows of ended episodes, robot by robot, from T steps of N robots."""
+    """Return the rows of episodes that ended, robot by robot, from T steps of N robots.
+
+    Episodes with an invalid step are left out.
+    """
     steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
     flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
     ended = steps["ended"]
-    later = np.cumsum(ended[:, ::-1], axis=1)[:, ::-1].reshape(-1)  # ends from here on
+    later = np.cumsum(ended[:, ::-1], axis=1)[:, ::-1].reshape(-1)  # ends from this step on
     robot = np.repeat(np.arange(len(ended)), ended.shape[1])
     episode = np.unique(robot * (ended.shape[1] + 1) - later, return_inverse=True)[1].reshape(-1)
     broken = np.isin(episode, episode[flat["invalid"]])
@@ -525,7 +528,7 @@ def _ended(
 def _labels(
     conditions: Sequence[Condition], rows: dict[str, NDArray[Any]], episode: Ints, step: Ints
 ) -> NDArray[np.str_]:
-    """Return the primary condition of each row, by the rules that label logs."""
+    """Return the primary condition of each row, computed as for logs."""
     ends = np.flatnonzero(rows["ended"])
     order = np.argsort(np.concatenate([np.arange(len(episode)), ends + 0.5]), kind="stable")
     columns: dict[str, Any] = {

@@ -1,10 +1,10 @@
-"""Show that a policy is not worse than what drives today, in every condition, or say where not.
+"""Test in every condition whether a policy is not worse than the baseline that drives today.
 
 Both drive the same missions in the twin, pair by pair, until each cell (a condition, on some
 floors, under a perturbation, by one measure) is decided or the budget ends. The policy passes if
-it is shown in *every* cell to be worse by less than the margin. A policy that is worse by the
-margin or more in any cell passes only if that cell errs, so the error of the whole verdict is that
-of one cell. "Worse" is said of a cell with an error that is divided by the number of cells.
+*every* cell shows that it is worse by less than the margin. A policy that is worse by the margin or
+more in any cell passes only if that cell errs, so the error of the whole verdict is that of one
+cell. The error of calling a cell "worse" is divided by the number of cells.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ Document = dict[str, Any]
 FOLDER = "gate"  # in a run
 DOCUMENT, EPISODES = "gate.json", "episodes.parquet"
 ERROR = 0.05  # of the whole verdict
-FIRST_SEED = 1_000_000  # far from those of evaluations
-ROUND = 32  # pairs of a kind that are driven before what is decided is asked again
-MAX_MISSIONS = 3  # a kind in two forms has two cells, and drives up to so many times the budget
+FIRST_SEED = 1_000_000  # far from the seeds of evaluations
+ROUND = 32  # pairs of a kind that are driven between two checks of what is decided
+MAX_MISSIONS = 3  # budgets that a kind may drive: one with several cells needs more than one
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What a policy may not be worse in.
+    """A measure by which a policy may not be worse.
 
-    `better` is by how much it was better in a pair of episodes (policy, baseline), or None where
-    that says nothing; at most `bound` either way, and more counts as that much. `variance` is what
-    is expected of it.
+    `better` returns by how much the policy was better in a pair of episodes (policy, baseline), or
+    None if the pair does not show it. It is clipped to ±`bound`. `variance` is its expected
+    variance.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Measure:
 
 
 def _less(name: str) -> Callable[[EpisodeResult, EpisodeResult], float | None]:
-    """Return by how much less a policy has of something than the baseline; None: one has none."""
+    """Return a `better` that is the baseline's value of a field less the policy's."""
 
     def better(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
         own, other = getattr(policy, name), getattr(baseline, name)
@@ -102,7 +102,7 @@ BUMPS = "bumps_per_km"
 STOPPED = "stopped_s"
 MEASURES = {
     one.name: one
-    for one in (  # docs/eval.md says what each is
+    for one in (  # described in docs/eval.md
         Measure(SUCCESS, "", 1, 0.25, _success),
         Measure(BUMPS, "/km", 10, 0.1, _less("bumps")),
         Measure("closest_person_m", "m", 2, 0.1, _closest),
@@ -118,13 +118,13 @@ class Cell:
 
     layouts: str
     perturbation: str
-    condition: str  # with how much of the aisle is blocked
+    condition: str  # with the blocked share of the aisle, if it has one
     measure: Measure
     margin: float  # in the measure's unit
     error_high: float  # of calling it worse
-    scale: float = 1.0  # what one unit of the margin is of a difference between two episodes
+    scale: float = 1.0  # difference between two episodes per unit of the margin
     pairs: int = 0
-    unknown: int = 0  # pairs in which the measure says nothing
+    unknown: int = 0  # pairs in which the measure is None
 
     def __post_init__(self) -> None:
         self.sequence = ConfidenceSequence(
@@ -136,7 +136,7 @@ class Cell:
         )
 
     def add(self, pairs: Sequence[tuple[EpisodeResult, EpisodeResult]]) -> None:
-        """Take a round of pairs (policy, baseline) into account."""
+        """Add a round of pairs (policy, baseline)."""
         for policy, baseline in pairs:
             self.pairs += 1
             if (better := self.measure.better(policy, baseline)) is None:
@@ -147,12 +147,12 @@ class Cell:
 
     @property
     def decided(self) -> bool:
-        """Return whether the policy is shown to be not worse here, or to be worse."""
+        """Return whether the policy is shown to be worse or not worse in this cell."""
         return self.verdict != NOT_SHOWN
 
     @property
     def name(self) -> str:
-        """Return the condition as people read it, and what of the cell is not usual."""
+        """Return a name for people: the condition, then perturbation and measure if unusual."""
         parts = [_words(self.condition)]
         parts += [self.perturbation] * (self.perturbation != CLEAN)
         parts += [_words(self.measure.name)] * (self.measure.name != SUCCESS)
@@ -160,7 +160,7 @@ class Cell:
 
     @property
     def verdict(self) -> str:
-        """Return what is shown here."""
+        """Return what is shown: "not worse", "worse" or "not shown"."""
         if self.sequence.above_at is not None:
             return NOT_WORSE
         return WORSE if self.sequence.below_at is not None else NOT_SHOWN
@@ -194,12 +194,12 @@ def _km_driven(pairs: Sequence[tuple[EpisodeResult, EpisodeResult]]) -> float:
 
 @dataclass(frozen=True)
 class GatePlan:
-    """What to drive; every name was checked."""
+    """A checked request for a gate."""
 
-    plans: tuple[EvaluationPlan, ...]  # one for each text of floors
+    plans: tuple[EvaluationPlan, ...]  # one per value of `layouts`
     margins: Mapping[str, float]  # by measure
-    budget: int  # pairs of a cell
-    gap: TwinGap | None
+    budget: int  # pairs per cell
+    gap: TwinGap | None  # None if it was not measured
 
     @property
     def run(self) -> Run:
@@ -208,7 +208,7 @@ class GatePlan:
 
     @property
     def baseline(self) -> str:
-        """Return the baseline as evaluations name it."""
+        """Return the baseline's name in evaluations."""
         return self.plans[0].policies[1]
 
     @property
@@ -231,19 +231,19 @@ def plan_gate(
     budget: int = 1000,
     first_seed: int = FIRST_SEED,
 ) -> GatePlan:
-    """Check a request; nothing is driven.
+    """Check a request without driving anything.
 
     Args:
         baseline: planner, operator, random, cloned, a run's folder, or a file.onnx.
-        margins: by how much the policy may be worse, by measure; success .05 if it is not named.
-        conditions: kinds of missions; none: those that the run was trained on.
-        layouts: floors, each text judged by itself; none: the run's own.
-        budget: pairs of episodes of each cell at most.
+        margins: by how much the policy may be worse, by measure; .05 for success unless given.
+        conditions: kinds of missions; empty: those that the run was trained on.
+        layouts: floors in the form of `env.layouts`, each judged by itself; empty: the run's own.
+        budget: largest number of pairs of episodes per cell.
 
     Raises:
-        RunError: no such run or policy, an interrupted run whose policy is not its latest, or a
-            condition in which the twin is not to be trusted.
-        ConfigError: a margin, condition, budget or seed that cannot give a verdict.
+        RunError: the run or a policy is missing, the run was interrupted after its policy was
+            saved, or the twin cannot be trusted in a condition.
+        ConfigError: no verdict is possible with a margin, condition, budget or seed.
     """
     margins = {SUCCESS: 0.05, **(margins or {})}
     _check_margins(margins, limiter)
@@ -276,14 +276,14 @@ def plan_gate(
 
 
 def policy_name(baseline: str) -> str:
-    """Return a baseline as evaluations name it: a folder is a run, a .onnx file is a policy."""
+    """Return a baseline's name in evaluations: "run:" for a folder, "onnx:" for a .onnx file."""
     if Path(baseline).is_dir():
         return f"run:{baseline}"
     return f"onnx:{baseline}" if baseline.endswith(".onnx") and ":" not in baseline else baseline
 
 
 def find_gap(run: Run) -> TwinGap | None:
-    """Return the twin's gap to the logs, as measured for the run or for its panel's store."""
+    """Read the twin's gap to the logs, measured for the run or its panel's store, if it was."""
     panel = run_panel(run.document)
     places = [run.path]
     if panel is not None and "://" not in str(panel.header.store):
@@ -313,7 +313,7 @@ def _check_margins(margins: Mapping[str, float], limiter: str | None) -> None:
 
 
 def _check_budget(budget: int, margins: Mapping[str, float]) -> None:
-    """Raise ConfigError if even policies that never differ would not be decided."""
+    """Raise ConfigError if the budget is too small even for policies that never differ."""
     needed = max(
         pairs_needed(MEASURES[name].bound, -margin, variance=MEASURES[name].variance)
         for name, margin in margins.items()
@@ -321,14 +321,14 @@ def _check_budget(budget: int, margins: Mapping[str, float]) -> None:
     )
     if budget < needed:
         raise ConfigError(
-            f"{budget:,} pairs of episodes cannot show anything by these margins",
+            f"{budget:,} pairs of episodes cannot show anything with these margins",
             where="--budget",
             remedy=f"give at least {needed}; policies that differ in some episodes need more",
         )
 
 
 def _refuse_meaningless(plan: GatePlan, config: TrainConfig) -> None:
-    """Raise an error if a verdict would mean nothing."""
+    """Raise ConfigError or RunError if a verdict would mean nothing."""
     first, where = plan.plans[0], str(plan.run.path)
     kinds = tuple(first.episodes)
     for one in plan.plans:
@@ -353,8 +353,8 @@ def _refuse_meaningless(plan: GatePlan, config: TrainConfig) -> None:
     unfinished &= schedule.seconds is None or seconds < schedule.seconds
     if unfinished and origin is not None and origin.env_steps < origin.run_env_steps:
         raise RunError(
-            f"was interrupted after {steps:,} of {schedule.env_steps:,} steps, and what would be"
-            f" judged is the {origin.text}",
+            f"was interrupted after {steps:,} of {schedule.env_steps:,} steps, so the gate would"
+            f" judge the {origin.text}",
             where=where,
             remedy=f"finish it: `restock train --resume {quoted(where)}`",
         )
@@ -373,7 +373,7 @@ def drive_gate(plan: GatePlan, progress: Callable[[str], None] = lambda text: No
     """Drive pairs until every cell is decided or has its budget; write and return the document.
 
     The document is written to RUN/gate/gate.json, the episodes to RUN/gate/episodes.parquet.
-    `progress` is called after each round with what is still open.
+    `progress` is called after each round with a text on how many cells are still open.
     """
     cells: dict[tuple[str, ...], Cell] = {}
     tables = [_drive(one, plan, cells, progress) for one in plan.plans]
@@ -390,7 +390,7 @@ def _drive(
     cells: dict[tuple[str, ...], Cell],
     progress: Callable[[str], None],
 ) -> pa.Table:
-    """Drive one set of floors; add to the cells, and return the table of episodes."""
+    """Drive on one set of floors, add to `cells`, and return the table of episodes."""
     env = evaluation_env(plan)
     env.limits = plan.limits
     drivers = {name: make_policy(name, plan) for name in plan.policies}
@@ -422,7 +422,7 @@ def _drive(
                     scale = _km_driven(several) if measure == BUMPS else 1.0
                     error = ERROR / gate.cells
                     cells[key] = Cell(*key[:3], MEASURES[measure], margin, error, scale)
-                    if measure == BUMPS:  # these pairs gave the scale: they decide nothing
+                    if measure == BUMPS:  # these pairs gave the scale, so they must not count
                         continue
                 cells[key].add(several)
         for name, kind, _ in open_:
@@ -472,7 +472,7 @@ def _document(plan: GatePlan, cells: Sequence[Cell]) -> Document:
 
 
 def _claim(plan: GatePlan, cells: Sequence[Document], verdict: str) -> str:
-    """Say in a sentence what was shown."""
+    """Return what was shown as a sentence."""
     who = f"the policy of {plan.run.path.name} against {plan.baseline}"
     names = {
         word: list(dict.fromkeys(cell["name"] for cell in cells if cell["verdict"] == word))
@@ -490,7 +490,7 @@ def _words(name: str) -> str:
 
 
 def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
-    """Say what the verdict is not about."""
+    """Yield sentences on what the verdict does not cover."""
     first = plan.plans[0]
     yield (
         f"A policy that is worse by a margin or more in any condition passes with a probability of"
@@ -499,11 +499,11 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
     )
     if plan.gap is None:
         yield (
-            "How far the twin is from the robot was not measured: `restock twin gap STORE` does."
+            "The gap between twin and robot was not measured: `restock twin gap STORE` does that."
         )
     else:
         shown = ", ".join(f"{_words(one.condition)} {one.verdict}" for one in plan.gap.verdicts)
-        yield f"The twin by its gap to the logs: {shown}."
+        yield f"Verdicts on the twin's gap to the logs: {shown}."
     if left := [kind for kind in KINDS if kind not in first.episodes]:
         yield f"Conditions that were not tested: {', '.join(map(_words, left))}."
     if left := [name for name in PERTURBATIONS if name not in (*first.perturbations, "nominal")]:
@@ -520,10 +520,11 @@ def _limits(plan: GatePlan, cells: Sequence[Document]) -> Iterator[str]:
 
 
 def passed_gate(path: Path, baseline: str) -> Document:
-    """Read a run's last gate, whatever its verdict; it must be of this baseline and policy.
+    """Read a run's last gate, whatever its verdict.
 
     Raises:
-        RunError: there was none, it is damaged, or it judged something else.
+        RunError: there was none, it is damaged, or it judged another baseline or another policy
+            than the one that the run has now.
     """
     again = f"run `restock gate {quoted(path)} --baseline {quoted(baseline)}`"
     file = path / FOLDER / DOCUMENT
@@ -531,7 +532,7 @@ def passed_gate(path: Path, baseline: str) -> Document:
         raise RunError("was not judged by `restock gate`", where=str(path), remedy=again)
     document = read_json(file)
     if not isinstance(document, dict) or "cells" not in document:
-        raise RunError("is not the document of a gate", where=str(file), remedy=again)
+        raise RunError("is not the result of a gate", where=str(file), remedy=again)
     if document["baseline"] != policy_name(baseline):
         raise RunError(
             f"is a gate against {document['baseline']}, not {baseline}",

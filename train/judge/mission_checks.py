@@ -1,7 +1,7 @@
-"""Check missions as a whole: do goals come nearer, on whose floor, and which missions are kept.
+"""Check missions as a whole: their goals, their floor, their drivers, and which ones are missing.
 
-A row cannot show that its goal is another mission's, that racks stand elsewhere than in the twin,
-or that the missions that went well were left out.
+A single row cannot show that its goal is another mission's, that racks stand elsewhere than in the
+twin, or that the missions that went well were left out.
 """
 
 from __future__ import annotations
@@ -44,31 +44,31 @@ from restock.train.twin.floors.placed import (
 LOST = "rows lost"
 NEARER = "goals come nearer"
 AWAY = 0.05  # of the missions
-_DRIVEN_M = 2.0  # from which on a mission shows whether it goes to its goal
-_SHORTER = 0.3  # m of plan less, at least, for each metre driven
-_JUMP = 0.06  # of the plan's entry, which is in tens of metres: a plan was replaced
-_STRAIGHT = 0.7  # of the way driven, from its begin to its end: who wanders has no goal
+_DRIVEN_M = 2.0  # shorter drives do not show whether a mission goes to its goal
+_SHORTER = 0.3  # least metres by which the plan becomes shorter per metre driven
+_JUMP = 0.06  # in tens of metres of plan; larger changes in one step mean that it was replaced
+_STRAIGHT = 0.7  # least distance from start to end over metres driven; less is wandering
 FLOOR = "floor"
 MOVED_M = 0.25
 _SEARCH_M, _STEP_M, _FINE_M = 2.5, 0.25, 0.05
 _RETURNS = 3000
-_MISSIONS = 6  # in which a floor is looked at
+_MISSIONS = 6  # fewer missions with lidar returns are not compared with a floor
 RANGES, SECTORS, ON_RACKS = "lidar ranges", "lidar sectors", "missions racks"
-ON_FLOOR = 0.5  # of what sectors see, as far off as the others: else it is another floor
+ON_FLOOR = 0.5  # least share of ranges that agree with the floor; with less, it is another floor
 RANGE_M = 0.1
 BLIND = 0.0  # of the sectors
-_LOOKS, _RAYS = 800, 3  # of rows, and of each sector
-_NEARBY = 0.6  # of the lidar's range: a wall nearer than that is seen
-_BETTER = 0.05  # of what sectors see, more with a move of the racks than without
-_LOOKED = 40  # times, for a sector or a mission to be judged
+_LOOKS, _RAYS = 800, 3  # rows that are compared, and rays per sector
+_NEARBY = 0.6  # of the lidar's range: nearer walls should be seen
+_BETTER = 0.05  # least gain in the share that agrees, for a move of the racks to be applied
+_LOOKED = 40  # ranges without which a sector or a mission is not judged
 DRIVEN = "driver"
 OTHER_DRIVER = 0.1  # of the stretches
-_ALIKE = 0.1  # of the others' stretches, at most, are taken for another driver's
+_ALIKE = 0.1  # largest share of the others' stretches that may be taken for another driver's
 _STRETCH = 10  # steps
 CHOSEN = "chosen on outcome: "
-GAP = 0.3  # of the share that succeeds
-_MIN_MISSIONS = 5  # with and without
-_MET = 0.2  # of a condition's episodes, for an exposure to be their situation
+GAP = 0.3  # in the share of episodes that succeed
+_MIN_MISSIONS = 5  # with a condition, and without it
+_MET = 0.2  # share of a condition's episodes in which its situations (exposures) occur
 
 _SIGNALS = (
     f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
@@ -82,7 +82,7 @@ _SIGNALS = (
 
 
 def with_missions(store: Store, rows: FedRows) -> FedRows:
-    """Return the rows with their poses, their episodes' success, and their situations."""
+    """Fill in the fields of rows that only their store has: poses, success, labels, drivers."""
     fed = pa.table({"transition_id": rows.transition_id})
     with passed_in(store.connection, fed=fed):
         table = store.connection.sql(_SIGNALS, params=[rows.task.hash]).to_arrow_table()
@@ -104,9 +104,9 @@ def with_missions(store: Store, rows: FedRows) -> FedRows:
 def mission_checks(
     logs: FedRows, twin: FedRows | None, floors: Sequence[Warehouse], others: FedRows | None = None
 ) -> Iterator[Comparison]:
-    """Check goals, the floor, whether conditions are of missions that failed, and who drove.
+    """Check lost rows, goals, the floor, whether conditions come from failures, and who drove.
 
-    `others` are the logs' rows beside these.
+    `others` are the rows of the other robots or recordings, if `logs` are only a part.
     """
     yield _lost(logs)
     yield _nearer(logs, twin)
@@ -116,7 +116,7 @@ def mission_checks(
 
 
 def _lost(rows: FedRows) -> Comparison:
-    what = "rows that were written of a recording and are gone"
+    what = "row that ingest wrote for a recording and that is gone"
     if rows.counted is None:
         return not_run(LOST, what, "no store")
     written, held = rows.counted[np.unique(rows.recording, return_index=True)[1]].T
@@ -125,7 +125,7 @@ def _lost(rows: FedRows) -> Comparison:
 
 
 def _nearer(logs: FedRows, twin: FedRows | None) -> Comparison:
-    what = "mission drives metres that do not bring its goal nearer"
+    what = "mission drives without coming nearer to its goal"
     if logs.task.goal == "none" or logs.pose is None:
         reason = "no store with poses" if logs.pose is None else "the task has no goal"
         return not_run(NEARER, what, reason)
@@ -134,9 +134,9 @@ def _nearer(logs: FedRows, twin: FedRows | None) -> Comparison:
 
 
 def _strayed(rows: FedRows) -> tuple[int, int]:
-    """Count the missions whose plan does not become shorter, of those that show it.
+    """Count the missions whose plan does not become shorter, and those that were judged.
 
-    Who bumps into something on the way shows nothing: it may have had no goal.
+    Short missions are not judged, nor those that end in a bump, which may have had no goal.
     """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
     seen = (now < 1.0) & (after < 1.0) & (np.abs(now - after) < _JUMP)
@@ -160,9 +160,9 @@ def _on_floor(
 ) -> Iterator[Comparison]:
     """Find the move of the twin's racks that fits the lidar best, and test it on other missions.
 
-    Then compare the lidar with the racks where they are.
+    Then compare the lidar's ranges with the racks and walls of the floor that fits best.
     """
-    what = "racks against where the lidar sees them, on the twin's floor"
+    what = "distance of the floor's racks from where the lidar sees them"
     if rows.pose is None or not rows.task.lidar or not floors:
         missing = "the robot has no lidar" if not rows.task.lidar else "no store with poses"
         yield not_run(FLOOR, what, missing)
@@ -194,8 +194,8 @@ def _on_floor(
     if on_free_ground(floor, driven + move).mean() < PLACED or not ranges:
         reason = (
             f"these logs are of another floor ({share:.0%} of the lidar's returns lie on racks of"
-            f" {floor.name!r}): `restock twin layout --from` makes theirs, and `restock diagnose"
-            " PLACE FLOOR.toml` compares with it"
+            f" {floor.name!r}): `restock twin layout --from` makes that floor, and `restock"
+            " diagnose PLACE FLOOR.toml` compares with it"
         )
         yield not_run(FLOOR, what, reason)
         return
@@ -220,9 +220,10 @@ def _on_floor(
 def _ranges(
     rows: FedRows, floor: Warehouse, move: F64, twin: FedRows | None
 ) -> Iterator[Comparison]:
-    """Compare what each sector sees with the floor's racks and walls there.
+    """Compare each sector's ranges with the distances to the floor's racks and walls.
 
-    Nothing if most of it is not on this floor.
+    Yields nothing if fewer than `ON_FLOOR` of the ranges agree: the logs are of another floor.
+    `move` (2,) is applied to the poses if that fits clearly better.
     """
     assert rows.pose is not None
     kept = np.flatnonzero(np.isfinite(rows.pose).all(axis=1))
@@ -232,7 +233,7 @@ def _ranges(
         least, most = _expected(rows.task, floor, rows.pose[kept], by)
         shown = (least > 0.1) & (least < _NEARBY * rows.task.range_max_m) & (most - least < 0.6)
         if twin is not None:
-            shown &= (twin.sectors() < 1.0).any(axis=0)  # the others are no part of its lidar
+            shown &= (twin.sectors() < 1.0).any(axis=0)  # not covered by the twin's lidar
         off = clearance - least
         near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
         if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
@@ -243,13 +244,13 @@ def _ranges(
     (middle,) = clustered_quantiles(
         away[plain], cluster, (0.5,), rng=np.random.default_rng(0), resamples=RESAMPLES
     )
-    what = "how much farther the lidar sees than to the floor's racks and walls"
+    what = "range of the lidar less the distance to the floor's racks and walls"
     yield judged(RANGES, what, "difference", middle, logs=middle.value, twin=0.0, least=-RANGE_M,
                  most=RANGE_M, logs_rows=len(kept))  # fmt: skip
     looked, seen = plain.sum(axis=0), (alike & plain).sum(axis=0)
     blind, judged_ones = seen < looked / 2, looked >= _LOOKED
     bearings = (np.flatnonzero(blind & judged_ones) + 0.5) * 360 / rows.task.sectors - 180
-    what = "sector that mostly sees nothing of the floor's racks and walls"
+    what = "sector that mostly does not see the floor's racks and walls"
     yield share_judged(SECTORS, what, len(bearings), int(judged_ones.sum()), BLIND,
                        note=", ".join(f"{one:+.0f}" for one in bearings))  # fmt: skip
     plain &= ~blind
@@ -262,9 +263,9 @@ def _ranges(
 
 
 def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, F64]:
-    """Return the clearance (N, S) of each sector from poses (N, 3), by racks and edges alone.
+    """Return the clearance (N, S) expected in each sector from poses (N, 3), from racks and walls.
 
-    The least and the most of some rays of it.
+    Returns the minimum and the maximum over `_RAYS` rays of the sector.
     """
     width = 2 * np.pi / task.sectors
     inside = (np.arange(_RAYS) + 0.5) / _RAYS * width
@@ -278,15 +279,15 @@ def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, 
         for rack in (Rect(0.0, 0.0, floor.width_m, floor.depth_m), *floor.racks):
             ends = [np.stack([rack.edges[at] - x, rack.edges[at + 1] - y]) * along for at in (0, 2)]
             near, far = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
-            hit = far if nearest.min() == 1e6 else near  # the floor's edges, from inside
+            hit = far if nearest.min() == 1e6 else near  # the first is the floor, from inside
             nearest = np.where((hit > 0) & (near <= far), np.minimum(nearest, hit), nearest)
     clear = (nearest - outline_reach(bearing, task.body)).reshape(len(pose), task.sectors, _RAYS)
     return clear.min(axis=2), clear.max(axis=2)
 
 
 def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
-    """Compare who is said to have driven with whose driving in the other rows it is like."""
-    what = "stretch of a driver that is driven like another's in the other rows"
+    """Compare the stored driver with the driver in the other rows whose style is most similar."""
+    what = "stretch that is driven in the style of another driver"
     if others is None or rows.driver is None or others.driver is None:
         return not_run(DRIVEN, what, "no other rows of a store to compare with")
     names = [name for name in np.unique(others.driver).tolist() if name]
@@ -298,7 +299,7 @@ def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
     middle, spread = style[known].mean(axis=0), style[known].std(axis=0) + 1e-9
     (style, own) = ((each - middle) / spread for each in (style, _style(rows)))
     right = np.stack([others.driver == name for name in names], axis=1)[known]
-    weight = (right / right.sum(axis=0)).sum(axis=1, keepdims=True)  # each driver's alike
+    weight = (right / right.sum(axis=0)).sum(axis=1, keepdims=True)  # equal total per driver
     square = (style[known] * weight).T @ style[known] + 1e-3 * np.eye(style.shape[1])
     fit = np.linalg.solve(square, (style[known] * weight).T @ right)
     level = (style[known] * weight).sum(axis=0) / len(names) @ fit
@@ -316,14 +317,17 @@ def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
 
 
 def _stretches(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
-    """Return the stretch (N,) of each row, of one driver in one episode, and their drivers."""
+    """Return the stretch of each row (N,), and each stretch's driver.
+
+    A stretch has consecutive rows of one driver in one episode.
+    """
     assert rows.driver is not None
     begins = np.append(True, (np.diff(rows.episode) != 0) | (rows.driver[1:] != rows.driver[:-1]))
     return np.cumsum(begins) - 1, rows.driver[begins]
 
 
 def _style(rows: FedRows) -> F64:
-    """Return what a row (N, F) shows of how its driver answers to the plan and to obstacles."""
+    """Return features (N, F) of how a row's driver responds to the plan and to obstacles."""
     speed, turn = (rows.command() / np.abs(rows.task.actions).max(axis=0).clip(1e-9)).T
     near = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     shown = [speed, np.abs(turn), turn * near, np.abs(turn - near), speed * np.abs(near)]
@@ -337,7 +341,10 @@ def _style(rows: FedRows) -> F64:
 
 
 def _best_move(floor: Warehouse, places: F64) -> F64:
-    """Return by how much (2,) places fit a floor's walls best, to `_FINE_M`; a short move wins."""
+    """Return the move (2,) with which places fit a floor's walls best, to `_FINE_M`.
+
+    Longer moves have a small penalty.
+    """
     places = places[:: len(places) // _RETURNS + 1]
     best = np.zeros(2)
     for step, reach in ((_STEP_M, _SEARCH_M), (_FINE_M, _STEP_M)):
@@ -353,14 +360,14 @@ def _best_move(floor: Warehouse, places: F64) -> F64:
 
 
 def _by_mission(values: F64, mission: np.ndarray, chosen: Bools) -> F64:
-    """Return the mean of values (M,) in each of the chosen missions."""
+    """Return the mean of the values (M,) that are `chosen`, per mission."""
     number = np.unique(mission[chosen], return_inverse=True)[1].reshape(-1)
     return np.asarray(np.bincount(number, values[chosen]) / np.bincount(number))
 
 
 def _chosen(rows: FedRows) -> Iterator[Comparison]:
-    """Compare each condition's episodes with others in the situations that they met."""
-    what = "of the episodes in the same situations, those without the condition that succeed more"
+    """Compare the success of each condition's episodes with others in the same situations."""
+    what = "success without the condition less success with it, in the same situations"
     if rows.held is None or rows.success is None:
         yield not_run(CHOSEN.strip(": "), what, "no store with outcomes")
         return

@@ -1,7 +1,7 @@
-"""Check that stored labels and ends follow from the stored signals, by the rules that made them.
+"""Check rows against the rows around them, the task's rewards, the twin's values and the store.
 
-A store keeps the signals that conditions were computed from, so conditions can be computed again,
-and so can terminations. A panel is held against the store that it was made from.
+A store keeps the signals that labels and terminations were computed from, so both can be computed
+again. A panel's labels are compared with those of the store that it was made from.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from restock.train.judge.fed_rows import (
 )
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
-MOST = 0.005  # of the rows: by definition none is
+MOST = 0.005  # of the rows; by definition no row may be off
 _EQUAL = 1e-4
 
 
 def row_order(rows: FedRows) -> Iterator[Comparison]:
-    """Check rows against the rows before and after them: which are off, of which."""
+    """Check rows against the rows before and after them."""
     joined, before = rows.joined, np.maximum(np.arange(len(rows)) - 1, 0)
     held, previous = rows.previous_action(), rows.action[before]
     apart = _differ(rows.next_observation[before], rows.observation)
@@ -60,7 +60,7 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     own = rows.previous_action(after=True) != rows.action
     strange = own | (np.abs(after - nearer) > 10 * _EQUAL).any(axis=1)
     own_again = same[strange & rows.last].sum() > 0.8 * (strange & rows.last).sum()
-    of_end = "it repeats the row's own observation" if own_again else "it is another's, or missing"
+    of_end = "it repeats the row's own observation" if own_again else "it is wrong or missing"
     late = np.diff(rows.logged_ns, prepend=0) > 1.5e9 * rows.task.control_period_s
     together = np.bincount(rows.episode, apart & late & joined) > 0
     begins = np.append(True, rows.last[:-1])[: len(rows)]
@@ -69,21 +69,21 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     cut = np.array([last and (name, bytes(after)) in begun for name, after, last in goes_on], bool)
     for check, what, off, of in (
         ("chain", "next observation is not the observation of the next row", apart, joined),
-        ("previous action", "observation does not hold the action of the row before",
+        ("previous action", "observation does not contain the action of the row before",
          held != previous, joined),
-        ("own action", "next observation does not hold the row's own action",
+        ("own action", "next observation does not contain the row's own action",
          own, np.ones(len(rows), np.bool_)),
         ("foresight", "observation contains the action that is only taken afterwards",
          held == rows.action, joined & (rows.action != previous)),
         ("closing", "clearances did not change as in the observation",
          (np.abs(change - closing) > 10 * _EQUAL).any(axis=1), joined),
-        ("unchanged", "next observation is the observation, though the robot moves", same,
+        ("unchanged", "next observation equals the observation, though the robot moves", same,
          moving & ~rows.last),
         ("last next", "last next observation of an episode does not follow from its row", strange,
          rows.last),
-        ("split episodes", "episode stops where another begins, and has no end", cut,
+        ("split episodes", "episode without an end stops where another begins", cut,
          rows.last & ~rows.terminated & ~rows.truncated),
-        ("joined episodes", "episode leaves out time, and goes on elsewhere",
+        ("joined episodes", "episode skips time, and continues elsewhere",
          together[rows.episode], rows.last),
     ):  # fmt: skip
         note = of_end if check == "last next" else ""
@@ -104,14 +104,14 @@ def _differ(first: F32, second: F32) -> Bools:
     return np.asarray((np.abs(first - second) > _EQUAL).any(axis=1), np.bool_)
 
 
-SCALE = 1.05
+SCALE = 1.05  # largest ratio of rewards, or its inverse
 OTHER = 0.05  # of the rows
 LOST = 0.05  # of the ends
 UNCAUSED = "terminated without cause"
-_JUMP_M = 0.9  # a plan was replaced
+_JUMP_M = 0.9  # larger changes in one step mean that the plan was replaced
 _TOUCHING_M = 0.05
-_TELLING = 0.05  # of a reward: more than float32 and a noisy clearance make
-_ARRIVED_M = 0.15  # of plan beyond the goal's radius: the plan is never shorter than the way
+_TELLING = 0.05  # a reward, or its error, above the noise of float32 and clearances
+_ARRIVED_M = 0.15  # plan left beyond the goal's radius: a plan is never shorter than the distance
 
 
 def implied_reward(rows: FedRows) -> F64:
@@ -132,13 +132,13 @@ def implied_reward(rows: FedRows) -> F64:
     parts = reward_parts(task, now, after, progress, rows.action, rows.previous_action())
     implied = np.asarray(sum(parts.values()), np.float64)
     implied[(clearance < _TOUCHING_M) | arrived(rows) | rows.terminated] = np.nan
-    if rows.task.reward_terms:  # of signals that no observation holds
+    if rows.task.reward_terms:  # custom terms use signals that observations do not contain
         implied[:] = np.nan
     return implied
 
 
 def arrived(rows: FedRows) -> Bools:
-    """Return whether the robot is at its goal after each row (N,), by its plan."""
+    """Return whether the robot is at its goal after each row (N,), judged by its plan."""
     if rows.task.goal == "none":
         return np.zeros(len(rows), np.bool_)
     to_go = 10.0 * rows.after("goal_distance")
@@ -155,13 +155,13 @@ def _progress(rows: FedRows) -> F64:
 
 
 def outcomes(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
-    """Check rewards, then ends."""
+    """Check rewards, then terminations."""
     yield from _rewards(logs, twin)
     yield from _ends(logs, twin)
 
 
 def _rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
-    what = "reward against the task's own, of the same observations"
+    what = "reward against the task's own reward for the same observations"
     implied = implied_reward(logs)
     telling = np.abs(implied) > _TELLING  # False for NaN
     if len(np.unique(logs.cluster[telling])) < MIN_CLUSTERS:
@@ -187,7 +187,7 @@ def _rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
 
 
 def _unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
-    """Count rows whose reward is not the implied one times `scale`, of rows with an implied one."""
+    """Count rows whose reward is not `implied` times `scale`, and rows with an implied reward."""
     known = np.isfinite(implied)
     scale = scale if abs(scale) > _TELLING else 1.0
     off = np.abs(rows.reward[known] / scale - implied[known]) > _TELLING
@@ -212,7 +212,7 @@ def _ends(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
         there = arrived(rows) & rows.last
         return int((rows.terminated & there).sum()), int(there.sum())
 
-    what = "of the episodes that end at their goal, those terminated there"
+    what = "episode that ends at its goal is terminated there"
     if twin is not None:
         yield shares_compared(
             "terminated at the goal", what, at_goal(logs), at_goal(twin), -LOST, LOST
@@ -240,19 +240,19 @@ def _goal_reward(logs: FedRows, twin: FedRows | None) -> Comparison:
 
 
 BEYOND = 0.02  # of the rows
-SPREAD = 10.0  # of logs over the twin's, or its inverse
+SPREAD = 10.0  # largest ratio to the twin's, or its inverse
 TURNED_DEG = 20.0
-LIDAR_SCALE = 1.5  # of logs over the twin's, or its inverse
+LIDAR_SCALE = 1.5  # largest ratio to the twin's, or its inverse
 MEASURED = (
     *("wheel_speed", "localised_speed", "lateral_speed", "gyro_yaw_rate", "accel_x"),
     "goal_distance",
 )
-CLEARANCES = "clearances"  # of all sectors in the mean
-_MAY_BE_STILL = ("lateral_speed",)  # a robot that does not slide has none
-_WIDER = 1.0  # of the twin's range, on each side
+CLEARANCES = "clearances"  # their mean over all sectors
+_MAY_BE_STILL = ("lateral_speed",)  # always 0 if a robot does not slide
+_WIDER = 1.0  # allowed beyond the twin's range on each side, as a share of this range
 _STRAIGHT_RADPS = 0.15
 _DRIVING_MPS = 0.25
-_FAR = 0.97  # of the lidar's range
+_FAR = 0.97  # lidar entries beyond this saw nothing
 
 
 def values(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
@@ -302,11 +302,12 @@ def _entry(
 
 
 def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
-    """Check by how many degrees the logs' sectors are turned against the twin's (or a cosine).
+    """Check the lidar's bearing, and its scale against the twin's.
 
-    Then check how much nearer things come per metre driven, compared with the twin.
+    The bearing is the rotation in degrees at which the approach of things by sector is most like
+    the twin's, or like a cosine without a twin. The scale is how much nearer things come per metre.
     """
-    what = "bearing in which things come nearer when driving on"
+    what = "bearing in which things come nearer when driving straight on"
     if not logs.task.lidar:
         yield not_run("lidar bearing", what, "the robot has no lidar")
         return
@@ -322,7 +323,7 @@ def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Ite
         return
     turns = np.arange(task.sectors)
     turned = np.stack([np.roll(shape, turn) for turn in turns])  # (turns, sectors)
-    fits = found @ turned.T  # (1 + R, turns): how alike, at each turn
+    fits = found @ turned.T  # (1 + R, turns): similarity at each turn
     best = fits.argmax(axis=1)
     degrees = np.where(best > task.sectors // 2, best - task.sectors, best) * width
     low, high = percentiles(degrees[1:])
@@ -346,7 +347,11 @@ def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Ite
 
 
 def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
-    """Return how much nearer each sector comes per metre driven, (1 + R, sectors), bootstrapped."""
+    """Return how much nearer things come per metre driven, (1 + R, sectors); None if too few rows.
+
+    Values are relative to the mean over sectors. The first row is of all clusters, the others are
+    bootstrap draws.
+    """
     task = rows.task
     now, after = rows.sectors() ** 2 * task.range_max_m, rows.sectors(after=True) ** 2
     after = after * task.range_max_m
@@ -368,9 +373,9 @@ def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     return np.asarray(slope - slope.mean(axis=1, keepdims=True))
 
 
-FAR = 0.25  # from a command to its action, in units of the fastest action
-COARSE = 0.1  # of the commands, those so far
-DIFFERENT = 0.02  # of the rows that have a label, or should
+FAR = 0.25  # distance of a command from its action, in units of the fastest action
+COARSE = 0.1  # largest share of such commands
+DIFFERENT = 0.02  # of the rows that have a label, or should have it
 _LABELS = "row's label differs from what its conditions give on the stored signals"
 _FED = "row's label in the panel differs from that in its store"
 _ENDS = "termination of the row does not agree with its signals"
@@ -379,9 +384,10 @@ _ENDS = "termination of the row does not agree with its signals"
 def stored(
     store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
 ) -> Iterator[Flags]:
-    """Check commands, labels and terminations, in whole recordings of about 40,000 rows.
+    """Check commands, labels and terminations against the store that has the `rows`.
 
-    `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
+    Labels and terminations are checked in whole recordings, about `MAX_ROWS` rows in total.
+    `conditions` are those of the profile that can be computed from the stored signals.
     """
     yield _far_commands(store, rows)
     recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
@@ -396,7 +402,7 @@ def stored(
 
 
 def fed_labels(store: Store, rows: FedRows) -> Iterator[Flags]:
-    """Check, per condition, the panel's labels against those of its store."""
+    """Compare the panel's labels with those of its store, per condition."""
     fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
     with passed_in(store.connection, fed=fed):
         found = store.connection.sql(
@@ -427,7 +433,7 @@ def _far_commands(store: Store, rows: FedRows) -> Flags:
 
 
 def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
-    """Return recordings labelled by these rules and not corrected, and notes on the others."""
+    """Return recordings with labels of this version, and a note if there are others."""
     found = store.connection.sql(
         "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
         " GROUP BY ALL ORDER BY ALL",
@@ -448,7 +454,7 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
 
 
 def _whole(steps: LoggedSteps) -> Bools:
-    """Return whether each row (N,) is of an episode that is stored whole, with its end."""
+    """Return whether each row (N,) is of an episode that is stored completely, with its end."""
     ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
     broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
     return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)
@@ -458,7 +464,7 @@ def _labels(
     steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
 ) -> Iterator[Flags]:
     if not whole.any():
-        yield unflagged("labels", _LABELS, "no episode is stored whole")
+        yield unflagged("labels", _LABELS, "no episode is stored completely")
         return
     kept = np.flatnonzero(whole)
     ends = np.flatnonzero(whole[steps.ending])

@@ -1,9 +1,10 @@
 """Decide whether a mean difference is above a limit, at any time while pairs come in.
 
 A gambler bets that the mean is above a value c. After each difference x the wealth is multiplied by
-1 + bet * (x - c), with a bet that is chosen before x is seen. If the mean is c or less, the wealth
-grows in no bet on average, so it ever reaches 1/error with a probability of at most `error`
-(Ville's inequality). One may therefore look after every pair, and stop as soon as it does.
+1 + bet * (x - c), with a bet that is chosen before x is seen. If the mean is c or less, no bet
+makes the wealth grow on average, so the probability that it ever reaches 1/error is at most `error`
+(Ville's inequality). It may therefore be checked after every pair, and driving may stop once it
+does.
 
 Source: Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting",
 arXiv:2010.09686. The bets are theirs, for the alternative that matters here: that both policies
@@ -19,19 +20,19 @@ import numpy as np
 from restock.arrays import F64
 
 NOT_WORSE, WORSE, NOT_SHOWN = "not worse", "worse", "not shown"  # verdicts on a limit
-CANDIDATES = 400  # values between the bounds for which bets are made
-PRIOR_PAIRS = 50  # so many pairs count as much as the variance that is assumed before the first
-CAUTION = 0.8  # of the bet by which wealth grows fastest: chance then passes fewer worse policies
+CANDIDATES = 400  # intervals between -bound and bound; bets are made on each value between them
+PRIOR_PAIRS = 50  # the assumed variance counts as much as this many pairs
+CAUTION = 0.8  # of the bet with the fastest growth: fewer worse policies then pass by chance
 MAX_STAKE = 0.9  # share of the wealth that a bet may lose
 
 
 class ConfidenceSequence:
-    """Bounds of the mean of differences in [-bound, bound], valid after every pair at once.
+    """Bounds of the mean of differences in [-bound, bound] that hold after all pairs at once.
 
     Attributes:
-        low, high: the bounds after each pair, lists of n. The mean is below a `low` with a
-            probability of at most `error_low`, and above a `high` of at most `error_high`.
-        above_at: after how many pairs the mean was shown to be above `limit`, or None.
+        low, high: the bounds after each pair, lists of n. The probability that the mean is below
+            any `low` is at most `error_low`; that it is above any `high`, at most `error_high`.
+        above_at: number of pairs after which the mean was shown to be above `limit`, or None.
         below_at: the same for below.
     """
 
@@ -50,8 +51,8 @@ class ConfidenceSequence:
         self._limit_at = int(np.searchsorted(self.candidates, limit))
         self._variance = variance
         self._needed = math.log(1 / error_low), math.log(1 / error_high)
-        self._wealth = np.zeros((2, len(self.candidates)))  # log; that it is above, below
-        self._most = np.zeros_like(self._wealth)  # the largest so far
+        self._wealth = np.zeros((2, len(self.candidates)))  # log; bets on above, on below
+        self._most = np.zeros_like(self._wealth)  # largest `_wealth` so far
         self.pairs, self._sum, self._squares = 0, 0.0, 0.0
         self.low: list[float] = []
         self.high: list[float] = []
@@ -64,7 +65,7 @@ class ConfidenceSequence:
         return self._sum / self.pairs if self.pairs else None
 
     def add(self, difference: float) -> None:
-        """Take one more difference into account."""
+        """Add one difference."""
         above, below = bets(
             self.candidates,
             self.pairs,
@@ -80,7 +81,7 @@ class ConfidenceSequence:
         self.pairs += 1
         self._sum += difference
         self._squares += difference**2
-        not_below = self._most[0] < self._needed[0]  # values that the mean may still have
+        not_below = self._most[0] < self._needed[0]  # the mean is not shown to be above these
         not_above = self._most[1] < self._needed[1]
         self.low.append(float(self.candidates[not_below][0]) if not_below.any() else self.bound)
         self.high.append(float(self.candidates[not_above][-1]) if not_above.any() else -self.bound)
@@ -95,16 +96,16 @@ def bets(
 ) -> tuple[F64, F64]:
     """Return the next bets that the mean is above, and below, each value `at`.
 
-    The bet that makes wealth grow fastest is about gain / (spread + gain**2), where gain is
-    the mean above the value. The mean is taken to be what was seen so far, after `PRIOR_PAIRS`
-    equal ones, but no worse than half way from 0 to the value.
+    The bet that makes wealth grow fastest is about gain / (spread + gain**2), where gain is the
+    mean less the value. The mean is estimated from the differences so far and `PRIOR_PAIRS` zeros;
+    the estimate is no worse for the bet than half the value.
 
     Args:
         at: values, of any shape.
-        pairs: how many differences were seen.
-        total, squares: their sum and the sum of their squares; shapes that broadcast with `at`.
+        pairs: number of differences so far.
+        total, squares: their sum and the sum of their squares; must broadcast with `at`.
         bound: the largest possible difference.
-        variance: what is assumed before the first difference.
+        variance: assumed before the first difference.
     """
     mean = total / (PRIOR_PAIRS + pairs)
     spread = (PRIOR_PAIRS * variance + squares) / (PRIOR_PAIRS + pairs)
@@ -116,7 +117,7 @@ def bets(
 
 
 def pairs_needed(bound: float, limit: float, *, variance: float, error: float = 0.05) -> int:
-    """Return after how many pairs that never differ the mean is shown to be above `limit` < 0."""
+    """Return how many pairs without a difference show that the mean is above `limit` < 0."""
     sequence = ConfidenceSequence(bound, limit, variance=variance, error_low=error)
     while sequence.above_at is None:
         sequence.add(0.0)

@@ -1,18 +1,19 @@
 """Turn a run's evaluations into windows: figures of its critic, rows and target, and their limits.
 
-A window is one evaluation with the batches before it. Its figures, of a condition k or of all:
+A window is one evaluation with the batches since the evaluation before. Its figures, of one
+condition k or of all:
 
     G_k  |TD| held out / |TD| in replay, in condition k
     O_k  |TD| held out in k / the median condition's
     L    mean |Q - Q_target| / mean |Q|
     S    |TD| with the online network bootstrapping / |TD| with the target network
 
-A network that generalises, or memorises few rows, hides what is wrong with its replay from
-all of these. So three figures look at the rows, not at the critic
-(`restock.train.feed.logs`): how much of replay a condition is, beside how often it is met;
-how many of its logged rows look like it; and whether their next observations follow from them.
+If a network generalises, or memorises few rows, none of these shows what is wrong with its replay.
+So three figures describe the rows and not the critic (`restock.train.feed.logs`): a condition's
+share of replay over its share of driving, how many of its logged rows look like fresh rows of it,
+and whether their next observations follow from them.
 
-The limits are from faults planted in the twin (benchmarks/planted_faults.py; the table is in
+The limits were found with faults planted in the twin (benchmarks/planted_faults.py; the table is in
 docs/run.md).
 """
 
@@ -31,26 +32,26 @@ from restock.errors import RunError
 from restock.train.run.run import Run
 
 Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
-_MIN_ROWS = 20  # held out, for a condition to be diagnosed
-_MIN_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
+_MIN_ROWS = 20  # held-out rows that a condition needs to be diagnosed
+_MIN_TD_ROWS = 100  # and for its TD errors, which scatter by factors over a few episodes
 
 
 @dataclass(frozen=True)
 class DiagnosisLimits:
     """Limits beyond which a figure is a symptom."""
 
-    gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
-    relative: float = 3.0  # and G_k over the median G
+    gap: float = 3.0  # G_k of a condition; O_k if the condition is not in replay
+    relative: float = 3.0  # G_k over the median G; both limits must be passed
     gap_everywhere: float = 6.0  # the median G: everything is worse held out
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is effectively no target network
     clock: float = 2.0  # S
-    returns: float = 3.0  # |Q| over the largest return of an episode: the sum cancels in parts
-    explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
-    supply: float = 0.1  # a condition's share of replay over its share of what driving meets
-    agreement: float = 0.1  # of a condition's logged rows that look like it
-    unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
-    unexplained_relative: float = 1.6  # and over that of the condition with the least
+    returns: float = 3.0  # |Q| over the largest return of an episode, whose rewards may cancel
+    explained: float = 0.2  # of the targets' variance; a critic below it has learnt nothing
+    supply: float = 0.1  # a condition's share of replay over its share of driving, at least
+    agreement: float = 0.1  # of a condition's logged rows that look like fresh ones, at least
+    unexplained: float = 1.0  # of the next observations' variance; 1: their mean explains as much
+    unexplained_relative: float = 1.6  # the same over the condition with the least; both must pass
 
 
 LIMITS = DiagnosisLimits()
@@ -58,15 +59,15 @@ LIMITS = DiagnosisLimits()
 
 @dataclass(frozen=True)
 class Symptom:
-    """One condition in one window, or over several."""
+    """Figures of one condition in one window, or their medians over several."""
 
     condition: str
     gap: float | None  # G_k; None: not in replay, or too few rows
     outlier: float | None  # O_k; None: too few rows
     replay_share: float
-    met_share: float | None  # of the evaluations' steps
-    agreement: float | None  # of its logged rows with fresh ones
-    unexplained: float | None  # of the variance of its logged rows' next observations
+    met_share: float | None  # share of the evaluations' steps
+    agreement: float | None  # share of its logged rows that look like fresh ones
+    unexplained: float | None  # share of the variance of its logged rows' next observations
 
     @property
     def supply(self) -> float | None:
@@ -76,23 +77,23 @@ class Symptom:
 
 @dataclass(frozen=True)
 class Window:
-    """The figures of one evaluation, or of several."""
+    """The figures of one evaluation, or their medians over several."""
 
     gradient_steps: int
     symptoms: list[Symptom]
     gap_median: float
     lag: float  # L
     clock: float  # S
-    explained: float | None  # of the targets' variance, the median condition's
+    explained: float | None  # share of the targets' variance, in the median condition
     q_abs_max: float
-    q_bound: float  # the largest value that rewards seen could add up to
+    q_bound: float  # the largest |Q| that the observed rewards and returns allow
 
     def relative(self, symptom: Symptom) -> float | None:
-        """Return G_k divided by the median G: how much worse than the others the condition is."""
+        """Return G_k divided by the median G; None without G_k."""
         return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
 
     def bad(self) -> dict[str, list[str]]:
-        """Return the conditions whose replay is in doubt, with reasons in words."""
+        """Return the conditions whose replay is in doubt, with the reasons in words."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
         doubts = {}
@@ -144,7 +145,7 @@ class Window:
     def target(self) -> list[str]:
         """Return in words which figures put the target in doubt; empty if none does.
 
-        A value that is not a number is past every limit.
+        An L that is NaN is past its limit.
         """
         reasons = []
         if self.lag < LIMITS.no_lag:
@@ -164,16 +165,16 @@ class Window:
         return reasons
 
     def diverged(self) -> bool:
-        """Return whether values exceed the sum of rewards, or explain nothing of their targets."""
+        """Return whether values exceed what rewards allow, or hardly explain their targets."""
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return True
-        # A frozen target can be far from what it is learnt from; then the target is at fault.
+        # A frozen target can leave its values unexplained, too; then the target is at fault.
         if self.explained is None or self.target():
             return False
         return self.explained < LIMITS.explained
 
     def cause(self) -> Cause:
-        """Return the cause by these figures."""
+        """Return the cause that these figures show."""
         if self.diverged():
             return "DIVERGENCE"
         bad = self.bad()
@@ -186,7 +187,10 @@ class Window:
 
 
 def median_window(windows: Sequence[Window]) -> Window:
-    """Return the median of each figure over windows, of a condition over those that have it."""
+    """Return the median of each figure over windows; None values are ignored.
+
+    The number of updates and the |Q| are those of the last window.
+    """
 
     def middle(name: str, of: Sequence[Any] = windows) -> Any:
         known = [value for item in of if (value := getattr(item, name)) is not None]
@@ -212,7 +216,7 @@ def median_window(windows: Sequence[Window]) -> Window:
 
 
 def windows_of(run: Run) -> list[Window]:
-    """Return the windows of a run, one an evaluation that had updates before it."""
+    """Return the windows of a run: one per evaluation with audited batches before it."""
     query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
         for name in ("evaluation_buffer", "conditions", "progress"):
@@ -250,7 +254,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     weight = sum(row["evaluation_rows"] for row in known_well)
-    # Clip at 0: if robots stand, targets hardly vary and the share can be any size.
+    # Clipped at 0: if robots stand, targets hardly vary and the share can be very negative.
     reported = [row["explained"] for row in judged or known_well if row["explained"] is not None]
     known = [max(share, 0.0) for share in reported]
 
@@ -270,10 +274,11 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
 
 
 def _value_bound(run: Run) -> float:
-    """Return the largest |Q| that rewards and returns seen allow.
+    """Return the largest |Q| that the observed rewards and returns allow.
 
-    Rewards: r_max / (1 - gamma), with the largest in the audited batches. Returns: `LIMITS.returns`
-    times the largest of an episode driven, as if one shorter than 1 / (1 - gamma) steps went on.
+    By rewards, it is r_max / (1 - gamma) with the largest |reward| of the audited batches. By
+    returns, it is `LIMITS.returns` times the largest |return| of an episode; if episodes are
+    shorter than 1 / (1 - gamma) steps, the return is extrapolated to this length.
     """
     rewards = run.table("audit")["reward"].to_numpy()
     largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
