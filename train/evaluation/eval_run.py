@@ -5,8 +5,8 @@ split by how much of the aisle is blocked. Seeds differ from those that training
 episodes from and from those that chose the checkpoint.
 
 The references are scripted drivers that do not explore. The planner drives as a robot without
-learning would. The operator sees pallets, people and wet floor as they are, so it is an upper bound
-for a driver that knows everything.
+learning would. The operator gets the true pallets, people and wet floor from the simulation, so it
+is an upper bound.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ FIRST_SEED = 10_000
 
 
 def wrong_seed(seed: int, count: int = 1) -> str | None:
-    """Return what is wrong with a seed, or with `count` seeds from it on; None if nothing is."""
+    """Explain what is wrong with a seed, or with `count` seeds from it on; None if valid."""
     if 0 <= seed <= LAST_SEED + 1 - count:
         return None
     last = f" ({count:,} seeds from there on)" if count > 1 else ""
@@ -77,7 +77,7 @@ def reference(name: str, seed: int = 0) -> Policy:
     """Make the reference driver of this name.
 
     Raises:
-        ConfigError: there is none of the name.
+        ConfigError: no reference has this name.
     """
     from restock.train.twin.env.drivers import Operator, PlannerFollower, RandomPolicy
 
@@ -101,20 +101,20 @@ _PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What to evaluate, with all names checked."""
+    """A checked request for an evaluation."""
 
     run: Run
     config: TrainConfig
     policies: tuple[str, ...]
-    perturbations: dict[str, Perturbation | None]  # by the requested name or file
-    episodes: Mapping[str, int]  # by kind
+    perturbations: dict[str, Perturbation | None]  # by requested name or file; None: unperturbed
+    episodes: Mapping[str, int]  # kind -> number
     first_seed: int = FIRST_SEED
     num_envs: int = 32
     nthread: int = 0  # all cores
     layouts: str = "default"
-    limits: Limits | None = None  # every policy once more, with this limiter in front
-    left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
-    loaded: dict[str, Policy] = field(default_factory=dict)  # those of runs and files, by name
+    limits: Limits | None = None  # every policy drives once more, with this limiter
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # kind -> floors without room
+    loaded: dict[str, Policy] = field(default_factory=dict)  # policies of runs and files, by name
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ class EvaluationPlan:
 
     @property
     def origins(self) -> dict[str, PolicyOrigin]:
-        """Return the training step of the run's own policy and of each other run's."""
+        """Return the origin (the step of its run) of each policy that comes from a run."""
         own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
         return {name: origin for name, origin in own.items() if origin is not None}
 
@@ -171,15 +171,12 @@ def plan_evaluation(
     layouts: str | None = None,
     limiter: str | None = None,
 ) -> EvaluationPlan:
-    """Check a request. `layouts` None: the run's, with training floors' test split.
-
-    `limiter` is "profile", by the `[limiter]` of the run's
-    profile, or a TOML file with one.
+    """Check a request; the arguments are those of `evaluate`.
 
     Raises:
-        RunError: no such run, or it has no policy yet.
-        ConfigError: a policy or perturbation that does not exist, floors without room for any
-            kind of episode, no episodes, or a seed that generators do not take.
+        RunError: there is no such run, or it has no policy yet.
+        ConfigError: a policy or perturbation does not exist, the floors have no room for any kind
+            of episode, there are no episodes, or generators do not accept a seed.
     """
     run = Run.open(path)
     config = parse_config(run.document["config"], where=str(path / "config.json"))
@@ -207,14 +204,14 @@ def plan_evaluation(
         if is_cloned(name):
             cloned_panel(run, name)
         elif name == "agent" or _is_path("policies", name):
-            plan.loaded[name] = make_policy(name, plan)  # refused before anything is driven
+            plan.loaded[name] = make_policy(name, plan)  # raises before anything is driven
     return plan
 
 
 def refuse_unknown(
     what: Literal["policies", "perturbations"], names: Sequence[str], *, where: str
 ) -> None:
-    """Raise ConfigError if `restock eval` does not know a name, or there are no names."""
+    """Raise ConfigError if `restock eval` does not accept a name, or there are no names."""
     if what == "policies":
         choices, paths = ["agent", *REFERENCES, CLONED], _PATHS
     else:
@@ -233,10 +230,10 @@ def refuse_unknown(
 
 
 def episodes_of_kind(requested: int | str | Mapping[str, int]) -> dict[str, int]:
-    """Return episodes by kind, from one number for all or from the text `kind=N,kind=N`.
+    """Return the number of episodes per kind, from one number for all or from `kind=N,kind=N`.
 
     Raises:
-        ConfigError: no such kind, or not a number of at least 1.
+        ConfigError: there is no such kind, or a number is below 1 or not a number.
     """
     where = "--episodes"
     if isinstance(requested, str):
@@ -274,7 +271,7 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """Make a policy by its name: the run's own, a scripted one, a file's or another run's."""
+    """Make a policy by name: the run's own, a reference, a clone, or one of a file or other run."""
     if name in plan.loaded:
         return plan.loaded[name]
     if name == "agent":
@@ -286,10 +283,10 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
 
 
 def _limits(run: Run, named: str) -> Limits:
-    """Return the limits of a run's robot, by its profile or by a TOML file.
+    """Return the limits of a run's robot, from its profile or from a TOML file.
 
     Raises:
-        ConfigError: no such file, or its `[limiter]` cannot be used.
+        ConfigError: there is no such file, or it has no usable `[limiter]`.
     """
     profile = profile_of_run(run)
     given = profile.limiter
@@ -302,10 +299,11 @@ def _limits(run: Run, named: str) -> Limits:
 
 
 def _perturb(name: str) -> Perturbation | None:
-    """Return the perturbation of the episodes; None: as they are.
+    """Return the perturbation of this name or file; None for "none".
 
     Raises:
-        ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
+        ConfigError: there is no such name or file, or it is a schedule, or for another timestep
+            than the evaluation's.
     """
     if name == CLEAN:
         return None
@@ -317,7 +315,7 @@ def _perturb(name: str) -> Perturbation | None:
             f"is for a timestep of {perturbation.timestep_s:g} s, but the evaluation runs at "
             f"{Perturbation().timestep_s:g} s",
             where=name,
-            remedy="effective parameters depend on the timestep: fit them at this one",
+            remedy="effective parameters depend on the timestep: fit them at the evaluation's",
         )
     return perturbation
 
@@ -355,24 +353,24 @@ def evaluate(
     layouts: str | None = None,
     limiter: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Drive a run's policy and its references through the same episodes, as `restock eval`.
+    """Drive a run's policy and the references through the same episodes, as `restock eval` does.
 
     Returns a row per policy, perturbation and condition: success, return, bumps per km,
     closest approach to people and time lost against the planner, with 95 % intervals over episodes.
-    The episodes are kept in the run's `eval/episodes.parquet`.
+    The episodes are written to the run's `eval/episodes.parquet`.
 
     Args:
         policies: agent (the run's own), planner, operator, random, cloned (the way the logs were
             driven), `cloned:DRIVER`, `onnx:FILE` or `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
-        episodes: of each kind, or by kind: `{"nominal": 1000, "wheel_slip": 300}`.
-        layouts: floors to drive on; None: the run's own, of training floors the test split.
-        limiter: "profile", or a TOML file with a `[limiter]`: every policy drives once more with
-            it in front, as `limited:NAME`.
+        episodes: number of each kind, or per kind: `{"nominal": 1000, "wheel_slip": 300}`.
+        layouts: floors to drive on; None: the run's own, with test floors for training floors.
+        limiter: "profile" for the profile's `[limiter]`, or a TOML file with one: every policy
+            drives once more with this limiter, as `limited:NAME`.
 
     Raises:
-        RunError: no such run, or it has no policy yet.
-        ConfigError: no such policy or perturbation, or no floor with room for any episode.
+        RunError: there is no such run, or it has no policy yet.
+        ConfigError: there is no such policy or perturbation, or the floors have no room.
     """
     plan = plan_evaluation(
         Path(run),
@@ -391,7 +389,7 @@ def drive_evaluation(
 ) -> list[dict[str, Any]]:
     """Drive all episodes, add them to the run's `eval/episodes.parquet`, and return their rows."""
     env = evaluation_env(plan)
-    # One queue per policy over all perturbations, so that few environments wait for the last ones.
+    # One queue per policy over all perturbations, so that environments are idle only at its end.
     episodes = [
         (name, msgspec.structs.replace(spec, perturbation=perturbation))
         for name, perturbation in plan.perturbations.items()
@@ -456,7 +454,7 @@ def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
     """Return the episodes of a run's last evaluation, and a text that describes them.
 
     Raises:
-        RunError: nothing was driven, or the file is damaged.
+        RunError: there was no evaluation, or its file is damaged.
     """
     table, text = shown_evaluation(run)
     if not table.num_rows:
@@ -469,12 +467,12 @@ def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
 
 
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
-    """Return the quality of each cloned policy; empty before they have driven."""
+    """Return the quality of the plan's cloned policies that have driven."""
     return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
 
 
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
-    """Make the table of episodes, one row each."""
+    """Make the table of episodes, with one row per episode."""
     origins = {name: origin.env_steps for name, origin in plan.origins.items()}
     rows = [
         {

@@ -1,13 +1,13 @@
 """Drive policies through the same seeded episodes in the twin, without exploration.
 
 An episode is fully determined by its spec (condition, seed, perturbation), so every policy, run
-and checkpoint meets the same episodes and results can be compared episode by episode.
+and checkpoint drives the same episodes, and results can be compared episode by episode.
 
-The evaluations in training also measure the critic on their steps, which are in no replay. Replay
-measures itself: a critic that fits what it is fed has a low TD error there, whatever it is fed.
-What the critic gets wrong on evaluation steps and not in replay is what replay lacks. They also say
-how often each condition is met when driving, and what its observations look like. `restock
-diagnose` reads it.
+Evaluations during training also measure the critic on their steps, which are never in replay. On
+replay itself, a critic that fits its feed has a low TD error whatever it is fed. If it is wrong on
+evaluation steps and right on replay, replay lacks something. These steps also show how often each
+condition occurs when driving, and what its observations look like. `restock diagnose` reads these
+measurements.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """How one episode went."""
+    """The outcome of one episode."""
 
     condition: str
     block: str  # none | partial | full
     episode_seed: int
     success: bool | None  # None: the task has no goal
-    bumps: int  # contacts begun
+    bumps: int  # contacts that began
     time_s: float
     undiscounted_return: float
     end_x_m: float
     end_y_m: float
     failure: str | None  # stuck | timeout | bump | cut
     perturbation: str = "nominal"
-    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    perturbation_values: str = "{}"  # JSON: the parameters that are not nominal
     layout: str = "default"
     distance_m: float | None = None  # driven, over ground
     closest_person_m: float | None = None  # body edge to edge; None: there was no person
-    discounted_return: float | None = None  # None: no discount was named
-    limited_s: float | None = None  # that a limiter held a command back; None: there was none
-    stopped_s: float | None = None  # of that, to a stop
+    discounted_return: float | None = None  # None: no discount was given
+    limited_s: float | None = None  # time in which a limiter reduced commands; None: no limiter
+    stopped_s: float | None = None  # part of `limited_s` in which it stopped the robot
 
     @property
     def row(self) -> dict[str, Any]:
-        """Return the columns that every table of episodes has."""
+        """Return the columns that all tables of episodes have."""
         return {
             "condition": self.condition,
             "block": self.block,
@@ -93,9 +93,9 @@ def fixed_episodes(conditions: Sequence[str], episodes: int, first_seed: int) ->
 
 
 def evaluation_time_s(env: Twin, specs: Sequence[EpisodeSpec], time_limit_steps: int) -> float:
-    """Estimate how long driving these episodes takes: a few steps are made and timed.
+    """Estimate how long driving these episodes takes, by timing a few steps.
 
-    Episodes are taken to last a third of the time limit.
+    Assumes that episodes last a third of the time limit on average.
     """
     env.set_episodes(specs)
     env.reset(seed=0)
@@ -120,10 +120,10 @@ def run_episodes(
     step: Stepper | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Drive every episode to its end, N at a time; results in the order of `specs`.
+    """Drive every episode to its end, N at a time; return results in the order of `specs`.
 
-    `step` makes a step in place of `env.step`, given the observations (N, D) as well. Without a
-    `goal` success is None, and an episode fails by a bump alone. `discount` is of one step.
+    `step`, if given, is called in place of `env.step`, with the observations (N, D) as well.
+    Without a `goal`, success is None, and only episodes with a bump fail. `discount` is per step.
     """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
@@ -135,7 +135,7 @@ def run_episodes(
     touching = np.zeros(env.num_envs, np.bool_)
     total, discounted = np.zeros(env.num_envs), np.zeros(env.num_envs)
     distance = np.zeros(env.num_envs)
-    limited = np.zeros((2, env.num_envs), np.int64)  # steps held back, and to a stop
+    limited = np.zeros((2, env.num_envs), np.int64)  # steps that were limited, and stopped
     track = np.zeros((env.num_envs, time_limit_steps + 1, 2))
     track[:, 0] = _position(env.signals)
     left = len(specs)
@@ -160,7 +160,7 @@ def run_episodes(
         ended = np.flatnonzero(terminated | truncated)
         for place in ended:
             index = int(info["episode_number"][place])
-            # -1: the environment was done early and drives on, unrecorded.
+            # -1: the environment has no episodes left and keeps driving unrecorded.
             if index >= 0:
                 count = int(steps[place])
                 closest = info["closest_person_m"][place]
@@ -221,11 +221,11 @@ class Score:
     """The result of a greedy evaluation."""
 
     success: dict[str, float]  # per condition; empty if the task has no goal
-    success_mean: float  # over conditions, each counting the same; 0 without a goal
+    success_mean: float  # over conditions with equal weight; 0 without a goal
     return_mean: float
 
     def beats(self, other: Score | None) -> bool:
-        """Return whether mean success over conditions is higher or, on a tie, the return."""
+        """Return whether mean success is higher or, if it is equal, the mean return."""
         if other is None:
             return True
         best = (other.success_mean, other.return_mean)
@@ -246,12 +246,12 @@ def score(results: Sequence[EpisodeResult]) -> Score:
     return Score(success, average, float(np.mean(returns)))
 
 
-_ROWS = 512  # per condition, chosen by hash
+_ROWS = 512  # measured per condition, chosen by hash
 _CAPACITY = 16_384  # steps kept of one evaluation
 
 
 class EvaluationBuffer:
-    """The evaluation's twin, and the steps of the last episodes driven in it."""
+    """The evaluation's twin, and the steps of the last episodes that were driven in it."""
 
     def __init__(
         self,
@@ -273,9 +273,9 @@ class EvaluationBuffer:
         discount: float | None = None,
         between: Callable[[], None] = lambda: None,
     ) -> list[EpisodeResult]:
-        """Drive every episode, in the order of `specs`; what was kept before is forgotten.
+        """Drive every episode, in the order of `specs`, after dropping the steps of earlier ones.
 
-        `between` is called before every step; what it raises ends the drive.
+        `between` is called before every step; if it raises, the drive ends.
         """
         self._collector = self._empty()
 
@@ -296,7 +296,7 @@ class EvaluationBuffer:
 
     def _step(self, observation: F32, action: Ints) -> Step:
         collector = self._collector
-        collector.observation = np.array(observation, copy=True)  # the twin writes over its own
+        collector.observation = np.array(observation, copy=True)  # the twin overwrites its array
         step: Step = collector.start(action, np.ones(len(action), np.float32))
         ended = collector.finish(env_steps=0, gradient_steps=0, acting_step=0)
         number = step[4]["episode_number"]
@@ -305,7 +305,7 @@ class EvaluationBuffer:
         return step
 
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
-        """Return a row of the run's table per condition, from the last episodes driven."""
+        """Measure the critic on the last episodes' steps; return a row per condition."""
         self._collector.label(all_of_them=True)
         ring = self._collector.ring
         probe = Probe.of_ring(ring, _ROWS)

@@ -1,9 +1,9 @@
 """Drive episodes of an evaluation again and film them: worst failures and rescues by condition.
 
-An episode follows from its spec alone, so what `restock eval` recorded can be driven again with the
-policy that is kept. A film whose outcome is not the recorded one is not made: it would show another
-episode. A rescue shows two drives beside each other: the one that failed, and the agent's.
-Pictures are drawn from above and need no OpenGL.
+An episode is determined by its spec, so the episodes that `restock eval` recorded can be driven
+again with the kept policy. If the outcome differs from the recorded one, no film is made, as it
+would show another episode. A rescue shows two drives side by side: one that failed, and the
+agent's. Pictures are drawn from above and need no OpenGL.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 FOLDER = Path("eval") / "films"  # in a run
 DOCUMENT = "films.json"
 WORST, RESCUE = "worst failure", "rescue"
-RESCUED_FROM = ("planner", "cloned", "operator")  # and other runs: they come first
+RESCUED_FROM = ("planner", "cloned", "operator")  # policies to rescue from, after other runs
 OTHER_RUN = "run:"
 CAPTION_PIXELS, GAP_PIXELS = 44, 12
 MAX_FRAMES = 60
@@ -44,11 +44,11 @@ _SAME = ("success", "bumps", "time_s", "failure")
 
 @dataclass(frozen=True)
 class Scene:
-    """An episode that is worth looking at, as it was recorded."""
+    """A recorded episode that is worth watching."""
 
     kind: str  # WORST or RESCUE
-    row: dict[str, Any]  # the agent's, of RUN/eval/episodes.parquet
-    other: dict[str, Any] | None = None  # of a rescue: who failed while the agent arrived
+    row: dict[str, Any]  # the agent's row of RUN/eval/episodes.parquet
+    other: dict[str, Any] | None = None  # for a rescue: the row of a policy that failed there
 
     @property
     def name(self) -> str:
@@ -56,11 +56,11 @@ class Scene:
 
 
 def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
-    """Choose the scenes to film: per condition, unperturbed, a failure and a success of the agent.
+    """Choose the scenes to film: per condition, unperturbed, a failure and a rescue by the agent.
 
-    The failure is the one of the lowest return. The success is the one of the highest return in
-    which another policy failed: preferably that of another run, and of these the one that arrives
-    least often. Scenes that do not exist are left out.
+    The failure is that with the lowest return. The rescue is the agent's success with the highest
+    return among the episodes in which another policy failed. Policies of other runs are preferred,
+    those that arrive least often first. A condition may have no such scene.
     """
     clean = [row for row in rows if row["perturbation"] == CLEAN and row["success"] is not None]
     others = {
@@ -68,7 +68,7 @@ def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
         for row in clean
         if not row["success"]
     }
-    arrived: dict[str, int] = {}  # by each other run
+    arrived: dict[str, int] = {}  # policy of another run -> episodes in which it arrived
     for row in clean:
         if row["policy"].startswith(OTHER_RUN):
             arrived[row["policy"]] = arrived.get(row["policy"], 0) + row["success"]
@@ -98,10 +98,10 @@ def film_evaluation(
 ) -> tuple[list[Path], list[str]]:
     """Film the scenes of a run's recorded evaluation.
 
-    Returns files below RUN/eval/films, and what is not filmed with the reason.
+    Returns the files in RUN/eval/films, and the scenes that could not be filmed, with reasons.
 
     Raises:
-        RunError: nothing was driven on the plan's floors, or the run kept no policy.
+        RunError: no episode was driven on the plan's floors, or the run has no policy.
     """
     version = make_policy("agent", plan).version
     rows = [
@@ -131,7 +131,7 @@ def film_evaluation(
             before = _failure(plan, scene.other)
             if before is None:
                 other = scene.other["policy"]
-                missing.append(f"{scene.name}: {other}, which cannot be driven as it was")
+                missing.append(f"{scene.name}: the drive of {other} cannot be repeated exactly")
             else:
                 frames = _beside(before, frames, [_caption(scene.other), _caption(scene.row)])
         file = folder / f"{scene.name}.webp"
@@ -143,10 +143,10 @@ def film_evaluation(
 
 
 def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
-    """Film another policy's drive; None if it cannot be driven as it was.
+    """Film another policy's drive; None if it cannot be repeated exactly.
 
-    That is so if its run is gone or has changed, or if what it does depends on what drove beside
-    it.
+    That happens if its run is missing or has changed, or if its actions depend on the other
+    environments that it drove at the same time.
     """
     try:
         result, frames = drive_again(plan, row)
@@ -158,9 +158,9 @@ def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8
 def drive_again(
     plan: EvaluationPlan, row: dict[str, Any]
 ) -> tuple[EpisodeResult, list[NDArray[np.uint8]]]:
-    """Drive an episode once more with the policy that drove it.
+    """Drive an episode once more with the same policy.
 
-    Returns how it went, and a picture of each step (H, W, 3).
+    Returns its outcome, and a picture (H, W, 3) of the start and of each step.
     """
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
@@ -226,7 +226,7 @@ def _document(scene: Scene, file: str) -> dict[str, Any]:
 
 
 def _caption(row: dict[str, Any]) -> str:
-    """Say who drove and how it ended, in words that fit above a picture."""
+    """Return who drove and how it ended, short enough to fit above a picture."""
     ended = "arrives" if row["success"] else row["failure"]
     who = policy_words([row["policy"]])[row["policy"]]
     return f"{who}: {ended}, {row['time_s']:.1f} s"
@@ -237,7 +237,7 @@ def _beside(
 ) -> list[NDArray[np.uint8]]:
     """Put two drives side by side from their first steps, each under its caption.
 
-    The shorter one's last picture stays.
+    The last picture of the shorter drive stays until the longer one ends.
     """
     height, width = left[0].shape[:2]
     font = ImageFont.load_default(size=28)
@@ -257,7 +257,7 @@ def _beside(
 
 
 def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Encode an endless WebP of at most MAX_FRAMES frames; the last one stays for a second."""
+    """Encode frames as an endless WebP of at most MAX_FRAMES; the last is shown for a second."""
     picked = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))
     images = [Image.fromarray(frames[i]) for i in picked.tolist()]
     durations = [FRAME_MS] * (len(images) - 1) + [1000]

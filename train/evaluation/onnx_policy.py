@@ -1,7 +1,7 @@
-"""A policy as an ONNX file: for a robot that has no PyTorch, and for whatever else can act.
+"""A policy as an ONNX file, for robots without PyTorch and for other programs.
 
-The file's metadata holds all that is needed to use it, as JSON: the task, with its observation
-entries in order, the action table in m/s and rad/s, and the control period.
+The file's metadata has all that is needed to use it, as JSON: the task with its control period, the
+names of the observation's entries in order, and the table of actions in m/s and rad/s.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ _OPSET = 18
 def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     """Write a run's policy to `out`: input `observation` (N, D), outputs `values` and `action`.
 
-    `values` are (N, A), `action` is (N,). With a teacher's filter both networks are in it, and the
-    values of actions that are not plausible are -inf.
+    `values` are (N, A), `action` is (N,). If a teacher filters actions, its network is in the
+    file, too, and the values of implausible actions are -inf.
 
     Raises:
-        RunError: no such run, no policy yet, or there is something at `out` already.
-        ConfigError: the extra `onnx` is not installed, or `out` lies within a store, a panel or
+        RunError: there is no such run, it has no policy yet, or `out` already exists.
+        ConfigError: the extra `onnx` is not installed, or `out` is inside a store, a panel or
             another run.
     """
     onnx = _onnx()
@@ -76,7 +76,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
 
 
 def to_onnx(network: PolicyNetwork) -> Any:
-    """Translate the network into an ONNX model, node for layer; a filter is in the same graph."""
+    """Translate a policy network, with its filter or proposals, into an ONNX model."""
     onnx = _onnx()
     graph = _Graph(onnx)
     if isinstance(network, FilteredNetwork):
@@ -101,7 +101,7 @@ def to_onnx(network: PolicyNetwork) -> Any:
             graph.constants,
         ),
         opset_imports=opsets,
-        # The oldest format that has these operators: robots have old runtimes, which refuse others.
+        # The oldest format with these operators, as the old runtimes of robots refuse newer ones.
         ir_version=onnx.helper.find_min_ir_version_for(opsets),
         producer_name="restock",
         producer_version=__version__,
@@ -140,11 +140,11 @@ class _Graph:
                 total = self.node("Add", [total, values], f"{name}.sum.{index}")
             count = self.constant(f"{name}.members", np.array(len(network.members), np.float32))
             return self.node("Div", [total, count], f"{name}.mean")
-        if type(network) is not QNetwork:  # of an algorithm with a network of its own
+        if type(network) is not QNetwork:  # the algorithm has its own kind of network
             raise ConfigError(
                 f"a {type(network).__name__} cannot be written as ONNX",
                 where="loss.algorithm",
-                remedy="export it with torch.onnx; only a plain QNetwork is translated here",
+                remedy="export it with torch.onnx; only a plain QNetwork can be exported here",
             )
         now = "observation"
         for index, layer in enumerate(network.body):
@@ -187,10 +187,11 @@ class _Graph:
 
 
 class OnnxPolicy:
-    """Acts by an ONNX file, greedily.
+    """A greedy policy from an ONNX file.
 
     Raises:
-        ConfigError: no such file, not a policy of this task, or the extra `onnx` is missing.
+        ConfigError: there is no such file, it is not a policy of this task, or the extra `onnx` is
+            not installed.
     """
 
     def __init__(self, path: Path, task: Task) -> None:
@@ -199,7 +200,7 @@ class OnnxPolicy:
         self.name, self.version = f"onnx:{path}", self._file.metadata.get("version", "")
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
-        """Return the best action (N,) of each observation (N, D), and 1 for its probability."""
+        """Return the best actions (N,) for observations (N, D), and their probabilities, all 1."""
         action = self._file.values(observation).argmax(axis=1)
         return action, np.ones(len(action), np.float32)
 

@@ -1,18 +1,18 @@
-"""Off-policy evaluation: estimate from logs of others what a policy is worth, before it drives.
+"""Off-policy evaluation: estimate a policy's value from logs of other drivers, before it drives.
 
-What is evaluated is the greedy policy made soft: with probability `epsilon` it acts at random. A
-deterministic one agrees with no long episode to its end, and its weights would all be zero.
+The evaluated policy is the greedy one made soft: with probability `epsilon` it acts at random. A
+deterministic policy would disagree with every long episode at some step, so all weights would be 0.
 
-Two estimators, over n logged episodes padded to T steps:
+There are two estimators, over n logged episodes padded to T steps:
 
-- fitted Q evaluation (`restock.train.dqn.fitted_q`; Le et al. 2019, arXiv:1903.08738): the mean of
-  the fitted model's V(s_0). No importance weights, and as wrong as the model is;
-- per-decision weighted importance sampling (Precup, Sutton and Singh 2000): each reward counts by
-  how much likelier the evaluated policy was to get that far. No model; consistent.
+- fitted Q evaluation (`restock.train.dqn.fitted_q`; Le et al. 2019, arXiv:1903.08738) is the mean
+  of the fitted model's V(s_0). It needs no importance weights, but is as wrong as the model;
+- per-decision weighted importance sampling (Precup, Sutton and Singh 2000) weights each reward by
+  how much likelier the evaluated policy was to get that far. It needs no model and is consistent.
 
-The weights of two policies that differ grow apart with every step, until one episode outweighs all
-others. If the effective sample size is below a stated share of the episodes, the weighted estimate
-is refused: a number from one episode is not printed as if it were from a hundred.
+The more two policies differ, the more unequal weights become with every step, until one episode
+outweighs all others. If the effective sample size is below a given share of the episodes, the
+weighted estimate is refused, so that a number from one episode is not taken for one from a hundred.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class OpeEpisodes:
-    """Logged episodes for the evaluated policy, padded with `ratio` 1 and `reward` 0."""
+    """Logged episodes with the evaluated policy's ratios, padded with `ratio` 1 and `reward` 0."""
 
     ratio: F64  # (n, T) probability of the action, evaluated policy / behaviour policy
     reward: F64  # (n, T)
@@ -84,12 +84,12 @@ class OpeEpisodes:
 
 
 def once(episodes: int) -> F64:
-    """Return counts that take every episode once, (1, n)."""
+    """Return counts in which every episode counts once, (1, n)."""
     return np.ones((1, episodes))
 
 
 def relative_weights(ratio: F64) -> F64:
-    """Return products of ratios up to each step (n, T), scaled so that each step's largest is 1."""
+    """Return products of ratios up to each step (n, T), scaled to a maximum of 1 at each step."""
     with np.errstate(divide="ignore"):  # -inf for 0
         logs: F64 = np.cumsum(np.log(ratio), axis=1)
     most = logs.max(axis=0, initial=-np.inf)
@@ -97,19 +97,19 @@ def relative_weights(ratio: F64) -> F64:
 
 
 def per_decision(logged: OpeEpisodes, counts: F64) -> F64:
-    """Estimate by per-decision weighted importance sampling; `counts` (B, n) -> (B,)."""
+    """Return estimates (B,) of per-decision weighted importance sampling, for `counts` (B, n)."""
     weight = relative_weights(logged.ratio)
     means = counts @ (weight * logged.reward) / np.maximum(counts @ weight, _TINY)  # (B, T)
     return np.asarray(means @ logged.discounts, np.float64)
 
 
 def fitted(logged: OpeEpisodes, counts: F64) -> F64:
-    """Return the model's mean value of the starts; `counts` (B, n) -> (B,)."""
+    """Return the model's mean values (B,) of the first observations, for `counts` (B, n)."""
     return np.asarray(counts @ logged.start_value / counts.sum(axis=1), np.float64)
 
 
 def observed(logged: OpeEpisodes, counts: F64) -> F64:
-    """Return what the behaviour policies achieved themselves; `counts` (B, n) -> (B,)."""
+    """Return the mean returns (B,) of the behaviour policies themselves, for `counts` (B, n)."""
     return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
 
 
@@ -123,17 +123,17 @@ def effective_episodes(ratio: F64) -> F64:
 
 @dataclass(frozen=True)
 class EssGate:
-    """The effective sample size that weighted estimates need at every step to be shown."""
+    """The effective sample size that weighted estimates need at every step."""
 
     share: float = 0.2  # of the episodes
     episodes: float = 5.0
 
     def refusal(self, logged: OpeEpisodes) -> str | None:
-        """Return why weighted estimators are refused, or None."""
+        """Explain why weighted estimators are refused; None if they are not."""
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
             return None
-        if len(logged) < self.episodes:  # refused even if policy and logs agree to the end
+        if len(logged) < self.episodes:  # refused even if policy and logs fully agree
             noun = "episode" if len(logged) == 1 else "episodes"
             return f"{len(logged)} {noun}, and weights need at least {self.episodes:g}"
         return (
@@ -154,13 +154,13 @@ class EssGate:
 
 @dataclass(frozen=True)
 class OpeEstimate:
-    """One estimator's answer: a value with its interval, or why there is none."""
+    """One estimator's value with its interval, or the reason why it is refused."""
 
     estimator: str
-    value: float | None
-    low: float | None = None  # None: a single episode has no interval, nor has FQE
+    value: float | None  # None if refused
+    low: float | None = None  # None with a single episode, and for FQE
     high: float | None = None
-    refused: str | None = None
+    refused: str | None = None  # the reason
 
 
 def estimate(
@@ -172,8 +172,8 @@ def estimate(
 ) -> list[OpeEstimate]:
     """Return every estimate, with a percentile bootstrap interval over whole episodes.
 
-    The interval covers what other episodes would have changed. FQE has none: it is a model's value
-    on the starts, and an interval over them would leave out what is wrong with the model.
+    The interval covers the choice of episodes. FQE has no interval: its value is that of a model,
+    and an interval over episodes would ignore the model's errors.
     """
     refused = gate.refusal(logged)
     counts = cluster_counts(len(logged), resamples, rng)
@@ -206,7 +206,7 @@ class OpeConfig:
 
 @dataclass(frozen=True)
 class OpePlan:
-    """What the off-policy evaluation of a run needs; nothing is fitted yet."""
+    """A checked request for an off-policy evaluation of a run; nothing is fitted yet."""
 
     path: Path
     policy: GreedyPolicy
@@ -225,7 +225,7 @@ class OpePlan:
 
     @property
     def updates(self) -> int:
-        """Return the number of updates of all models."""
+        """Return the total number of updates of the models to fit."""
         model = self.config.model
         cloned = bool(self.dataset.evaluation.unlogged.any())
         return model.cloning_updates * cloned + (
@@ -233,7 +233,7 @@ class OpePlan:
         )
 
     def document(self) -> dict[str, Any]:
-        """Return what would be evaluated, as JSON."""
+        """Return the plan as JSON values."""
         evaluated = self.dataset.evaluation
         return {
             "run": str(self.path),
@@ -254,11 +254,11 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 
     Args:
         path: the run.
-        logs: a store, or a panel whose held-out episodes count; default the run's own panel.
+        logs: a store, or a panel to use the held-out episodes of; None: the run's own panel.
 
     Raises:
-        RunError: no such run, no policy yet, or no episode that it did not learn from.
-        StoreError, PanelError: no such logs.
+        RunError: there is no such run, it has no policy yet, or it learned from all episodes.
+        StoreError, PanelError: the logs are missing or damaged.
     """
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
@@ -271,9 +271,9 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 def evaluate_planned(
     plan: OpePlan, progress: Callable[[int], None] | None = None
 ) -> list[dict[str, Any]]:
-    """Evaluate the policy of a run; write `RUN/eval/off_policy.parquet`, and return its rows.
+    """Evaluate the policy of a run, write `RUN/eval/off_policy.parquet`, and return its rows.
 
-    `progress` is called with 1 before every update of its models.
+    `progress` is called with 1 before every update of the models.
     """
     with torch_threads(plan.trained.threads):
         rows = evaluate_off_policy(
@@ -310,7 +310,7 @@ def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...
 
 
 def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
-    """Return what can be measured on logs: no success without goals, or with goals in hindsight."""
+    """Return the measures that logs allow: without success if goals are missing or in hindsight."""
     logged = task.goal == "route" and not dataset.hindsight
     return ("return", "success") if logged else ("return",)
 
@@ -324,9 +324,9 @@ def evaluate_off_policy(
     config: OpeConfig = OpeConfig(),
     between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
-    """Return the rows of `off_policy`: measure x condition of the episode x estimator.
+    """Return the rows of `off_policy`, one per measure, condition of the episode and estimator.
 
-    `between` is called before every update of its models; what it raises ends the evaluation.
+    `between` is called before every update of the models; if it raises, the evaluation ends.
     """
     results: list[dict[str, Any]] = []
     gate = EssGate()
@@ -358,7 +358,7 @@ def evaluate_off_policy(
                 "ess": ess,
                 "ess_steps": ess_steps,
                 "steps": part.ratio.shape[1],
-                "horizon": None,  # all of them are weighted
+                "horizon": None,  # all steps are weighted
                 "epsilon": config.epsilon,
                 "discount": gamma,
                 "estimated_share": estimated,
@@ -376,7 +376,7 @@ def padded_episodes(
     discount: float,
     epsilon: float,
 ) -> OpeEpisodes:
-    """Pad rows by episode (N,) to episodes (n, T), as policy and model see them."""
+    """Arrange N rows as padded episodes (n, T), with the policy's ratios and the model's values."""
     rows = steps.rows
     policy = soft_greedy(network, rows.observation, epsilon)
     at = np.arange(len(rows))
@@ -406,7 +406,7 @@ def behaviour_probability(
 ) -> tuple[F64, float]:
     """Return the probability of each logged action (N,), and the share that had to be estimated.
 
-    As logged; where the logs do not say, by cloning the behaviour of the training rows.
+    Probabilities that were not logged are estimated by cloning the behaviour of the training rows.
     """
     steps = dataset.evaluation
     unknown = steps.unlogged

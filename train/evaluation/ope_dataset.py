@@ -1,7 +1,7 @@
-"""The data set of an off-policy evaluation: logged episodes that the policy never learnt from.
+"""The data set of an off-policy evaluation: logged episodes that the policy never learned from.
 
-A policy is evaluated on whole episodes of which no row is in the panel that trained it. The models
-(the values, and where the logs do not say it the behaviour) are fitted on the panel's rows alone.
+A policy is evaluated on whole episodes without any row in the panel that trained it. The models are
+fitted only on the panel's rows: action values, and the behaviour if the logs lack probabilities.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from restock.replay.store.store import Store
 from restock.train.dqn.fitted_q import Transitions
 
 Measure = Literal["return", "success"]
-MODEL_ROWS = 200_000  # at most, chosen at random: bounds memory and time
+MODEL_ROWS = 200_000  # most rows that a model is fitted on, chosen at random; limits memory, time
 
 
 @dataclass(frozen=True)
 class OpeSteps:
-    """Rows by episode and step; episodes may be cut after their first steps."""
+    """N rows by episode and step; episodes may lack their last steps."""
 
     rows: Transitions
-    episode: Ints  # (N,) ascending, the place in `condition`
+    episode: Ints  # (N,) ascending, index in `condition`
     condition: NDArray[np.str_]  # (E,) of each episode
     probability: F64  # (N,) of the action, as logged; NaN if it was not logged
     bumps: Bools  # (N,) a contact in [t, t + 1)
@@ -44,8 +44,9 @@ class OpeSteps:
     def measured(self, measure: Measure) -> OpeSteps:
         """Return the same rows with the measure as their reward.
 
-        `return` is the task's own reward. `success` is 1 on reaching the goal and 0 else, and a
-        contact ends the episode: discounted by 1 it is the probability to arrive without any.
+        `return` is the task's own reward. `success` is 1 on reaching the goal and else 0, and a
+        contact ends the episode. With a discount of 1, its return is the probability of arriving
+        without contact.
         """
         if measure == "return":
             return self
@@ -76,28 +77,28 @@ class OpeSteps:
 
 @dataclass(frozen=True)
 class OpeDataset:
-    """What a policy is evaluated on, and what the models are fitted on."""
+    """The steps that a policy is evaluated on, and those that models are fitted on."""
 
-    training: OpeSteps  # that the policy learnt from: the models are fitted on them
+    training: OpeSteps  # that the policy learned from; for the models
     evaluation: OpeSteps  # of other episodes
-    notes: tuple[str, ...]  # what is worth saying
-    hindsight: bool = False  # goals in hindsight: to arrive is no success
+    notes: tuple[str, ...]  # for the user
+    hindsight: bool = False  # goals were set in hindsight, so arriving is not a success
 
 
 def load_ope_dataset(
     trained: Panel | None, task: Task, logs: str | None = None, *, seed: int = 0
 ) -> OpeDataset:
-    """Load episodes that a run did not learn from, and the rows that it did.
+    """Load episodes that a run did not learn from, and the rows that it did learn from.
 
     Args:
-        trained: the panel that the run learnt from; the models are fitted on its rows.
+        trained: the panel that the run learned from; the models are fitted on its rows.
         task: that the run was trained on.
-        logs: a store, or a panel, whose held-out rows then count; default the run's own panel.
-        seed: of the choice of rows for the models, where there are many.
+        logs: a store, or a panel to use the held-out rows of; None: the run's own panel.
+        seed: of the choice of rows for the models, if there are more than `MODEL_ROWS`.
 
     Raises:
         RunError: the run had no panel, no episode is left, or the logs are of another task.
-        StoreError, PanelError: no store or panel there, or it is no longer what it was.
+        StoreError, PanelError: a store or panel is missing or has changed.
     """
     if trained is None:
         raise RunError(
@@ -151,7 +152,7 @@ def _unsplit(trained: Panel) -> bool:
 
 
 def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
-    """Return whether some of these rows have a goal in hindsight."""
+    """Return whether some of these rows have a goal that was set in hindsight."""
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         ((found,),) = connection.sql(
             "SELECT coalesce(bool_or(goal_source = 'hindsight'), false) FROM transitions"
@@ -161,7 +162,10 @@ def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
 
 
 def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
-    """Open the store of the logs, and return the ids of the rows in question."""
+    """Open the store of the logs; return it with the IDs of its rows, or a panel's held-out ones.
+
+    `logs` None means the `trained` panel.
+    """
     panel: Panel | None = trained
     if logs is not None:
         location = Location.of(logs)
@@ -179,8 +183,8 @@ def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
     if tasks != {task.hash}:
         store.close()
         raise RunError(
-            f"its rows are of task {', '.join(sorted(map(str, tasks))) or 'none'}, the run's is"
-            f" {task.hash}",
+            f"its rows are of task {', '.join(sorted(map(str, tasks))) or 'none'}, but the run is"
+            f" of task {task.hash}",
             where=logs or str(store.path),
             remedy="ingest the logs again with the run's profile",
         )
@@ -188,7 +192,7 @@ def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
 
 
 def held_out_of(panel: Panel) -> Ints:
-    """Return the ids (n,) of held-out rows of a panel; raise PanelError if they are damaged."""
+    """Return the IDs (n,) of a panel's held-out rows; raise PanelError if the file is damaged."""
     split = panel.path / EVALUATION_SPLIT
     panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
     table = read_table(split, columns=["transition_id"], error=PanelError)
@@ -196,10 +200,10 @@ def held_out_of(panel: Panel) -> Ints:
 
 
 def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
-    """Return the held-out rows of a panel's first store; of one behaviour policy if it is named.
+    """Return the held-out rows of a panel's first store; only those of `driver` if it is given.
 
     Raises:
-        StoreError, PanelError: the store or the list of rows is no longer there.
+        StoreError, PanelError: the store or the list of rows is missing.
     """
     ids = held_out_of(panel)
     with panel_store(panel) as store:
@@ -215,7 +219,7 @@ def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
 
 
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
-    """Read the rows of these ids, by recording, episode and step."""
+    """Read the rows with these IDs, by recording, episode and step."""
     query = files(__package__).joinpath("ope_episodes.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         table = connection.sql(query).to_arrow_table()
@@ -251,7 +255,7 @@ def _matrix(column: pa.ChunkedArray) -> F32:
 
 
 def panel_store(panel: Panel) -> Store:
-    """Open the store of a panel, at its version; raise StoreError if no store was kept."""
+    """Open a panel's store at its version; raise StoreError if it was mixed from a table."""
     if panel.store_version < 0:
         raise StoreError(
             "was mixed from a table in memory: its held-out rows were not stored",
@@ -262,9 +266,9 @@ def panel_store(panel: Panel) -> Store:
 
 
 def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
-    """Return the rows whose episode has no row in the panel, and how many episodes had one.
+    """Return the rows of episodes without rows in the panel, and the number of episodes left out.
 
-    An episode that shows a row of the panel again, under another id, has one.
+    An episode is also left out if it has a copy of one of the panel's rows under another ID.
     """
     meta = trained.meta
     learnt = pa.table({"transition_id": meta["transition_id"]})

@@ -1,6 +1,7 @@
--- Rows for off-policy evaluation: those whose ids are in `wanted`. What happens before and after a row
--- in its episode is of all its rows from the first wanted one on. A contact of the last row is known
--- where it terminated the episode, and one that the first row tells of was before it.
+-- Rows for off-policy evaluation: those whose IDs are in `wanted`. Contacts before and after a row
+-- are looked up in all rows of its episode. A row's `bumped` is the contact before it, so the contact
+-- of a step is in the next row. For the last row it is known if it terminated the episode. Contacts
+-- before the first wanted row do not count.
 WITH whole AS (
     SELECT *,
            coalesce(lead(bumped) OVER episode, terminated AND ended_by = 'bump') AS bumps,
@@ -14,7 +15,7 @@ WITH whole AS (
     ) USING (episode_id)
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index),
            episode_so_far AS (episode ROWS BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW)
-), named AS (  -- an episode is of the condition that most of its labelled rows have, of equals the first
+), named AS (  -- an episode's condition is the most frequent one of its labelled rows; ties: the first
     SELECT episode_id,
            coalesce(mode(primary_condition ORDER BY step_index) FILTER (primary_condition <> 'nominal'), 'nominal') AS of_condition
     FROM whole

@@ -1,7 +1,6 @@
 """Pair the episodes that two policies both drove, and compare their success.
 
-Differences are paired by episode: both policies drive the same episode, so only the policies
-differ.
+As both policies drove the same episodes, differences are due to the policies alone.
 """
 
 from __future__ import annotations
@@ -18,22 +17,25 @@ from restock.train.run.run import Run
 
 AGENT = "agent"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive"]
-MARGIN = 0.05  # of success: a difference of no more is none
-MIN_EPISODES = 10  # of a row; fewer give no interval and no verdict
+MARGIN = 0.05  # success may be lower by this without being called worse
+MIN_EPISODES = 10  # with fewer there is no interval and no verdict
 Cell = tuple[str, str]  # perturbation, condition (with its block)
-Key = tuple[int, str]  # of an episode: seed, and the values of the perturbation in force
+Key = tuple[int, str]  # of an episode: seed, values of its perturbation
 Episodes = dict[Cell, dict[Key, tuple[float, float]]]  # success (NaN without a goal) and return
 
 
 def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
-    """Read what `restock eval` wrote of the run's own policy, or of another; None: none drove."""
+    """Read the episodes that `restock eval` drove with a run's policy; None if there are none.
+
+    `policy` names another policy of the same evaluation.
+    """
     table, _ = shown_evaluation(run.path)
     driven = table.filter(pc.equal(table["policy"], policy))
     return driven if len(driven) else None
 
 
 def by_cell(table: pa.Table) -> Episodes:
-    """Return success and return by perturbation and condition, and by episode."""
+    """Return success and return by cell and episode."""
     cells: Episodes = {}
     for row in table.to_pylist():
         cell = str(row.get("perturbation", "none")), cell_name(row["condition"], row["block"])
@@ -44,12 +46,12 @@ def by_cell(table: pa.Table) -> Episodes:
 
 
 def paired(first: Episodes, second: Episodes) -> list[dict[str, Any]]:
-    """Compare success on the episodes of both policies: a row per perturbation and condition.
+    """Compare success on the episodes that both policies drove: a row per cell.
 
-    Differences are those of the second, with 95 % intervals over episodes. The second is `worse` if
-    its success is lower by more than `MARGIN` and the interval below 0, `better` if the interval is
-    above 0. From fewer than `MIN_EPISODES` neither is told: the row is `inconclusive`. A task
-    without a goal has no rows.
+    Differences are the second's success less the first's, with 95 % intervals over episodes. The
+    second is `worse` if its success is lower by more than `MARGIN` and the interval is below 0,
+    `better` if the interval is above 0. With fewer than `MIN_EPISODES` the row is `inconclusive`.
+    A task without a goal has no rows.
     """
     rng = np.random.default_rng(0)
     driven = list(dict.fromkeys(perturbation for perturbation, _ in first))

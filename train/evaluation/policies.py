@@ -1,10 +1,11 @@
 """Load policies by name: a run's network, an ONNX file, or a clone of the logs' drivers.
 
-A clone is behaviour cloning, a reference in the twin: a network whose softmax is the probability of
-each action in the logs acts by these probabilities, as its drivers did, not by the likeliest. Its
-number of updates is that with the best likelihood on held-out episodes; `RUN/eval/clones.parquet`
-says how good the clone is on the rows that the panel holds out. Observations contain the last
-action, so repeating it agrees often: the file also has the agreement of repeating alone.
+A clone is made by behaviour cloning, and serves as a reference in the twin. The softmax of its
+network is the probability of each action in the logs, and the clone draws actions with these
+probabilities, as the drivers did. The number of updates is chosen by the likelihood of episodes
+that are set aside. `RUN/eval/clones.parquet` has the clone's quality on the panel's held-out rows.
+Observations contain the last action, and repeating it is often right, so the file also has the
+agreement of always repeating it.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class GreedyPolicy:
     def __init__(
         self, network: PolicyNetwork, version: str = "", origin: PolicyOrigin | None = None
     ) -> None:
-        """`origin` is the step of its run that it is from."""
+        """`origin` is the step of its run at which the network was saved."""
         self.network, self.version, self.origin = network, version, origin
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
@@ -72,8 +73,8 @@ def load_policy(name: str, task: Task) -> Policy | None:
     """Load the policy that `run:DIRECTORY` or `onnx:FILE` names; None for other names.
 
     Raises:
-        ConfigError: no such file, or a policy of another task.
-        RunError: no such run, one without a policy, or a damaged one.
+        ConfigError: there is no such file, or the policy is of another task.
+        RunError: there is no such run, or its policy is missing or damaged.
     """
     kind, _, path = name.partition(":")
     if kind == "onnx" and path:
@@ -87,7 +88,7 @@ def load_policy(name: str, task: Task) -> Policy | None:
     trained = profile_of_run(run).task
     if trained.hash != task.hash:
         raise ConfigError(
-            f"was trained on task {trained.hash}, this is {task.hash}",
+            f"was trained on task {trained.hash}, but this is task {task.hash}",
             where=path,
             remedy="give a run of this task",
         )
@@ -95,11 +96,11 @@ def load_policy(name: str, task: Task) -> Policy | None:
 
 
 def load_agent(run: Run) -> GreedyPolicy:
-    """Load the policy that drives, as `kept_policy` says: greedy, with its step as `origin`.
+    """Load the policy that a run drives with (`kept_policy`), as a greedy one.
 
     Raises:
-        RunError: it has made no update yet, its policy is missing or damaged, or it is of a task
-            that the profile no longer is.
+        RunError: the run has made no update yet, its policy is missing or damaged, or the profile's
+            task has changed since it was trained.
     """
     chosen = chosen_policy(run)
     latest = chosen == "latest"
@@ -126,11 +127,11 @@ def load_agent(run: Run) -> GreedyPolicy:
     network = make_policy(config, state["observation_size"], state["actions"], runs=runs)
     try:
         network.load_state_dict(state["network"])
-    except RuntimeError as error:  # torch's of other shapes or names
+    except RuntimeError as error:  # raised by PyTorch if shapes or names differ
         raise RunError(
-            f"its policy is not of the network that config.json describes: {first_mismatch(error)}",
+            f"its policy does not fit the network in config.json: {first_mismatch(error)}",
             where=str(file),
-            remedy="put the settings back that were changed in config.json: network, teacher",
+            remedy="undo the changes of network and teacher in config.json",
         ) from error
     env_steps, updates = state["env_steps"], state["gradient_steps"]
     origin = PolicyOrigin(chosen, env_steps, updates, env_steps_of(run))
@@ -138,10 +139,10 @@ def load_agent(run: Run) -> GreedyPolicy:
 
 
 def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
-    """Load the policy of the last checkpoint, as `save_agent` would have written it.
+    """Load the policy of the last checkpoint, in the form that `save_agent` writes.
 
     Raises:
-        RunError: the checkpoint is damaged, or not of the networks that config.json describes.
+        RunError: the checkpoint is damaged, or does not fit the networks in config.json.
     """
     state = checkpoint.load(run.latest)
     plain = msgspec.structs.replace(config, device="cpu")
@@ -150,9 +151,9 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
         learner.load_state_dict(state["learner"])
     except (KeyError, ValueError, RuntimeError, RunError) as error:
         raise RunError(
-            f"contains no policy of the network that config.json describes: {error}",
+            f"contains no policy that fits the network in config.json: {error}",
             where=str(run.latest),
-            remedy="put the settings back that were changed in config.json: network, teacher",
+            remedy="undo the changes of network and teacher in config.json",
         ) from error
     return {
         "network": dict(learner.policy.state_dict()),
@@ -165,12 +166,12 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
 
 
 def kept_one(state: Mapping[str, Any]) -> bool:
-    """Return whether the run had kept a policy when this checkpoint was taken."""
+    """Return whether the run had a best policy when this checkpoint was written."""
     return bool(state["progress"]["evaluated_at"] >= 0)
 
 
 def load_kept(run: Run) -> dict[str, Any]:
-    """Load what `save_agent` wrote, of a run that has kept a policy.
+    """Load the best policy, as `save_agent` wrote it.
 
     Raises:
         RunError: its file is missing or damaged.
@@ -191,7 +192,7 @@ def save_agent(
     score: Score,
     clocks: Mapping[str, int],
 ) -> None:
-    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`."""
+    """Save a network as the run's best so far; `clocks` are `env_steps` and `gradient_steps`."""
     state = {
         "network": dict(network.state_dict()),
         "observation_size": task.observation_size,
@@ -204,15 +205,15 @@ def save_agent(
 
 
 def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
-    """Write a run that acts by the mean of the values of several runs' policies, and load it.
+    """Write a run that acts by the mean of several runs' action values, and load its policy.
 
-    Runs that explored by themselves err differently, so their mean errs less (arXiv:1611.01929).
-    So does the mean of their behaviour networks' logits, which filters if theirs do. If the planner
-    taught them, the margin by which an action must be better than its proposal falls with the
-    errors, by the root of the number of runs. The run has no tables: it was fed nothing itself.
+    Independent runs have different errors, so their mean has smaller ones (arXiv:1611.01929). If
+    the runs filter actions, the mean of their behaviour networks' logits filters. If the planner
+    taught them, the margin by which an action must beat its proposal is divided by the root of the
+    number of runs, as errors are. The new run has no tables, as it was fed nothing itself.
 
     Raises:
-        RunError: they are not alike, or one has no policy.
+        RunError: the runs differ in more than their seeds, or one has no policy.
     """
     runs = [Run.open(path) for path in places]
     agents = [load_agent(run) for run in runs]
@@ -256,12 +257,12 @@ def _mean(networks: Sequence[Any]) -> Ensemble:
 
 
 CLONED = "cloned"
-UPDATES = (50, 100, 200, 400, 800, 1600)  # that are tried
-SET_ASIDE = 5  # every fifth episode chooses among them
+UPDATES = (50, 100, 200, 400, 800, 1600)  # numbers of updates that are tried
+SET_ASIDE = 5  # every fifth episode is set aside to choose between them
 
 
 class ClonedPolicy:
-    """A policy that takes each action with its probability in the logs, by its own seeded draws."""
+    """A policy that draws each action with its probability in the logs, from a seeded generator."""
 
     def __init__(self, network: QNetwork, quality: CloneQuality, version: str, seed: int) -> None:
         self.name, self.version = quality.policy, version
@@ -287,8 +288,8 @@ def cloned_panel(run: Run, name: str) -> Panel:
     """Open the panel whose rows a clone is fitted to.
 
     Raises:
-        ConfigError: the run learnt from no logs, or nobody of that name drove in them.
-        PanelError: the panel is no longer what it was.
+        ConfigError: the run did not learn from logs, or these have no driver of that name.
+        PanelError: the panel has changed.
     """
     panel = run_panel(run.document)
     if panel is None:
@@ -304,17 +305,17 @@ def cloned_panel(run: Run, name: str) -> Panel:
             f"its logs have no driver named {driver!r}",
             where=f"{run.path}, {name}",
             remedy=f"its drivers are "
-            f"{', '.join(known) or 'nobody: use cloned, which is of all rows'}",
+            f"{', '.join(known) or 'not named: use cloned, which clones all rows'}",
         )
     return panel
 
 
 def load_cloned(run: Run, name: str, *, seed: int = 0) -> ClonedPolicy:
-    """Load the clone of the logs' drivers, trained on first use and kept in `RUN/eval`.
+    """Load the clone of the logs' drivers, which is trained on first use and kept in `RUN/eval`.
 
     Args:
-        name: `cloned`, of all rows of the run's panel, or `cloned:DRIVER`, of one driver's.
-        seed: of what it draws as it drives.
+        name: `cloned` for all rows of the run's panel, or `cloned:DRIVER` for one driver's.
+        seed: of the actions that it draws.
 
     Raises:
         ConfigError, PanelError: as `cloned_panel`.
@@ -341,7 +342,7 @@ def load_cloned(run: Run, name: str, *, seed: int = 0) -> ClonedPolicy:
 
 
 def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
-    """Clone a panel's drivers; those of one name where `name` is `cloned:DRIVER`."""
+    """Clone a panel's drivers together, or a single one if `name` is `cloned:DRIVER`."""
     actions, driver = len(panel.task.actions), name.partition(":")[2]
     chosen = np.arange(len(panel))
     if driver:
@@ -376,9 +377,9 @@ def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
 
 
 def best_updates(observation: F32, action: Ints, episode: Ints, actions: int) -> int:
-    """Return the number of updates that gives held-out episodes the largest likelihood.
+    """Return the number of updates with the largest likelihood on episodes that are set aside.
 
-    If there is a single episode, its last fifth is held out. More updates would memorise rows.
+    More updates would memorise rows. If there is only one episode, its last fifth is set aside.
     """
     aside: Bools = episode % SET_ASIDE == SET_ASIDE - 1
     if not aside.any() or aside.all():
@@ -400,7 +401,7 @@ def _drivers(panel: Panel) -> list[str]:
 
 
 def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
-    """Return the panel's held-out observations and actions, or why there are none."""
+    """Return the panel's held-out observations and actions; if unreadable, none and the reason."""
     try:
         rows = held_out_rows(panel, driver or None)
     except (PanelError, StoreError) as error:
@@ -412,9 +413,9 @@ def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
 def _judged(
     network: QNetwork, observation: F32, action: Ints, frequencies: F32, first: int
 ) -> dict[str, Any]:
-    """Compute the held-out part of a `CloneQuality`.
+    """Compute the fields of a `CloneQuality` that describe held-out rows.
 
-    `first` is where an observation has the last action.
+    `first` is the index of the previous action in an observation.
     """
     if not len(action):
         unknown = ("log_likelihood", "frequencies_log_likelihood", "agreement", "repeating")
@@ -433,7 +434,7 @@ def _judged(
 
 
 def _frequencies(action: Ints, actions: int) -> F32:
-    """Count how often each action was taken (A,), plus one each, so that none has probability 0."""
+    """Return the share of each action (A,), after adding one to each count so that none is 0."""
     counts = np.bincount(action, minlength=actions) + 1
     return np.asarray(counts / counts.sum(), np.float32)
 
