@@ -1,10 +1,10 @@
-"""Calibration: fit the parameters under which the twin does what a log's robot did.
+"""Calibration: fit the parameters with which the twin moves as the robot did in a log.
 
-Commands of the log are driven open loop and the motion is compared
-(`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.fit_solver`). The
-search is coarse in one batch over the whole ranges, then least squares. A parameter that the log
-does not identify keeps its value, with the reason. Values are effective: they hold for the timestep
-at which they were fitted, which is the one training uses.
+The log's commands are driven open loop, and the motion is compared with the log's
+(`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.fit_solver`). A coarse
+search over the whole ranges comes first, then least squares. A parameter that the log does not
+identify keeps its value, with the reason. Values are effective: they hold only for the timestep at
+which they were fitted, which is that of training.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ class FitConfig:
     """Settings of a fit. The same values give the same result. Raises ConfigError if invalid."""
 
     parameters: tuple[str, ...] = DEFAULT
-    recordings: tuple[str, ...] = ()  # of the store; none: all
-    task_hash: str | None = None  # whose rows, where the store has several tasks
+    recordings: tuple[str, ...] = ()  # of the store; empty: all
+    task_hash: str | None = None  # needed if the store has rows of several tasks
     horizon_s: float = 3.0  # of the segments that are fitted
-    held_out: float = 0.25  # share of the log, to measure the gap on
+    held_out: float = 0.25  # share of the log on which the gap is measured
     search_points: int = 64  # of the coarse search
-    max_segments: int = 200  # of more than these, as many are drawn
+    max_segments: int = 200  # of more segments, this many are drawn
     seed: int = 0
     nthread: int = 1  # 0: every core
     name: str = "fitted"
@@ -100,13 +100,13 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class _FitData:
-    """The data of a fit: the segments to fit, and the held-out ones to measure on."""
+    """The data of a fit: the segments to fit, and what the held-out ones are cut from."""
 
     steps: LoggedSteps
-    recordings: tuple[str, ...]  # that any segment is of
+    recordings: tuple[str, ...]  # that have segments
     segments: LoggedSegments  # to fit
-    held_out_from_ns: dict[str, int]  # by recording
-    left_out: dict[str, int]  # segments or steps, by reason
+    held_out_from_ns: dict[str, int]  # recording -> time from which it is held out
+    left_out: dict[str, int]  # reason -> segments or steps
 
 
 def fit(
@@ -115,8 +115,9 @@ def fit(
     """Fit a twin to the recordings of a store.
 
     Raises:
-        ConfigError: no such recording, or the log identifies none of the parameters.
-        StoreError: no rows, rows of several tasks, or too few segments of ordinary driving.
+        ConfigError: there is no such recording, or the log identifies none of the parameters.
+        StoreError: there are no rows, rows of several tasks, or too few segments of ordinary
+            driving.
     """
     config, report = config or FitConfig(), on_progress or (lambda text: None)
     rng = np.random.Generator(np.random.PCG64(config.seed))
@@ -160,7 +161,7 @@ def fit(
 
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
-    """Cut at most `max_segments` segments of ordinary driving to fit, and the held-out ones."""
+    """Cut and draw at most `max_segments` segments of ordinary driving, not held out."""
     steps = logged_steps(store, config.task_hash, config.recordings)
     segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
@@ -194,7 +195,7 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
 def _search(
     residuals: ReplayResiduals, coordinates: Coordinates, config: FitConfig, report: Report
 ) -> F64:
-    """Search the whole ranges on few segments; return the best point (n,)."""
+    """Search the whole ranges with few segments; return the best point (n,)."""
     report(f"searching {config.search_points} points on {len(residuals.segments)} segments")
     scale = {name: CHANNELS[name][1] for name in residuals.channels}
     problem = FitProblem(residuals, coordinates, scale)
@@ -207,7 +208,7 @@ def _identify(
     residuals: ReplayResiduals, coordinates: Coordinates, start: F64, config: FitConfig,
     store: Store, report: Report,
 ) -> tuple[FitSolution, Uncertainty, list[ParameterEstimate]]:  # fmt: skip
-    """Fit by least squares, again without each parameter that proves unidentified."""
+    """Fit by least squares, and again without each parameter that turns out unidentified."""
     dropped: list[ParameterEstimate] = []
     while True:
         solution = _least_squares(residuals, coordinates, start, report)
@@ -250,7 +251,7 @@ def _least_squares(
 def _held_out_gaps(
     data: _FitData, scope: FitScope, config: FitConfig, fitted: Perturbation, report: Report
 ) -> tuple[HeldOutGap, ...]:
-    """Return the position gap on held-out segments, at 1, 3 and 6 s."""
+    """Measure the position gap on held-out segments of about 1, 3 and 6 s."""
     if "position" not in scope.channels or not config.held_out:
         return ()
     report("driving the held-out segments again")
@@ -272,7 +273,7 @@ def _held_out_gaps(
 
 
 def _deviations(residuals: ReplayResiduals, fitted: Perturbation) -> dict[str, dict[str, Any]]:
-    """Return the median deviations of each channel before and after the fit."""
+    """Return each channel's median deviation from the log, before and after the fit."""
     return {
         name: {
             "unit": CHANNELS[name][0],

@@ -1,15 +1,15 @@
 """The parameters that can be fitted, and the search for them: coarse, then by least squares.
 
-Residuals are the differences between replays and their log, by channel. Position and heading are
-compared after each predicted path was moved rigidly onto the logged one (by the mean heading and
-the mean position of the segment's fresh poses): a localiser's error at a segment's first pose would
-otherwise turn and shift the whole path. The twin's commands take effect at a physics step, so a
-replay knows latencies only in multiples of the timestep; between two of them residuals are
-interpolated, which makes the fit smooth.
+Residuals are the differences between replays and the log, by channel. Before position and heading
+are compared, each replayed path is moved rigidly onto the logged one (by the mean heading and
+position of the segment's fresh poses). Otherwise, a localiser's error at a segment's first pose
+would turn and shift the whole path. In the twin, commands take effect at a physics step, so a
+replay's latency is a multiple of the timestep. Residuals are interpolated between two of these,
+which makes the fit smooth.
 
-The search is coarse in one batch, then `mujoco.minimize.least_squares`. Residuals are counted in
-units of their channel's noise. Large ones count linearly, not by their square (soft L1), so that a
-wheel over a cable does not move the fit.
+A coarse search in one batch comes first, then `mujoco.minimize.least_squares`. Residuals are in
+units of their channel's noise. Large ones count linearly and not by their square (soft L1), so that
+a wheel that runs over a cable hardly moves the fit.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from restock.replay.store.store import Store
 from restock.train.twin.calibration.open_loop import LoggedSegments, OpenLoopResult, replay_segments
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
 
-BASE = Perturbation()  # the twin before the fit, and what is not fitted
-# Channel -> (unit, noise to begin with). What the log's noise is comes from the residuals later.
+BASE = Perturbation()  # the twin before the fit; has the values of parameters that are not fitted
+# Channel -> (unit, initial noise). Later, the log's noise is computed from residuals.
 CHANNELS: dict[str, tuple[str, float]] = {
     "wheel speed": ("m/s", 0.02),
     "wheel yaw rate": ("rad/s", 0.04),
@@ -41,7 +41,7 @@ CHANNELS: dict[str, tuple[str, float]] = {
     "heading": ("rad", 0.02),
 }
 _ODOMETRY = "nav_msgs/msg/Odometry"
-_GOAL = "geometry_msgs/msg/PoseStamped"  # a goal's type as often as a localiser's
+_GOAL = "geometry_msgs/msg/PoseStamped"  # used for goals as often as by localisers
 _POSE_TYPES = (
     "PoseWithCovarianceStamped",
     "PoseStamped",
@@ -57,25 +57,25 @@ class Parameter:
 
     name: str
     unit: str
-    step: float  # of a difference quotient; of a `ratio` the relative step
-    useful: float  # a 95 % interval wider than +- this (of a ratio: its logarithm) says too little
+    step: float  # of a difference quotient; relative for a `ratio`
+    useful: float  # widest useful half of a 95 % interval; for a `ratio`, of its logarithm
     ratio: bool = False  # searched by its logarithm
-    default: bool = True
-    own_body: bool = False  # says something of the twin's own body only
+    default: bool = True  # fitted unless others are requested
+    own_body: bool = False  # only meaningful if the log's robot has the twin's body
 
 
 PARAMETERS: dict[str, Parameter] = {
     item.name: item
     for item in (
-        # The floor's grip, and that of the left wheel: seen where wheels slide.
+        # Friction of the floor, and at the left wheel: identified when wheels slide.
         Parameter("friction_scale", "", 0.04, 0.4, ratio=True, own_body=True),
         Parameter("left_friction_scale", "", 0.04, 0.4, ratio=True, own_body=True, default=False),
-        Parameter("payload_kg", "kg", 2.0, 20.0, own_body=True),  # seen while speeds change
-        Parameter("wheel_radius_scale", "", 0.004, 0.02),  # way over ground, by the wheels' way
-        Parameter("track_scale", "", 0.004, 0.02),  # turn over ground, by the wheels' turn
+        Parameter("payload_kg", "kg", 2.0, 20.0, own_body=True),  # identified when speeds change
+        Parameter("wheel_radius_scale", "", 0.004, 0.02),  # distance over ground by that of wheels
+        Parameter("track_scale", "", 0.004, 0.02),  # turn over ground by that of the wheels
         Parameter("latency_s", "s", 0.01, 0.03),  # from an observation to the wheels' set point
-        Parameter("gain", "", 0.005, 0.02),  # wheel speed, by the commanded one
-        Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01),  # what the gyroscope says at rest
+        Parameter("gain", "", 0.005, 0.02),  # wheel speed ÷ commanded speed
+        Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01),  # the gyroscope's reading at rest
     )
 }
 MEASURED = ("wheel_radius_m", "track_m", "mass_kg", "max_accel_mps2", "max_yaw_accel_radps2")
@@ -83,16 +83,16 @@ DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 
 
 class Coordinates:
-    """The map between perturbations and points z of the unit cube, an axis per fitted parameter.
+    """The mapping between perturbations and points z of a unit cube with an axis per parameter.
 
-    Parameters that are not fitted stay as in `BASE`.
+    Parameters that are not fitted have the values of `BASE`.
     """
 
     def __init__(self, names: Sequence[str], task: Task) -> None:
         self.names, self.task = tuple(names), task
         self.parameters = [PARAMETERS[name] for name in names]
         ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
-        if "latency_s" in self.names:  # four commands are kept, and a later one is not simulated
+        if "latency_s" in self.names:  # the twin keeps only four commands to delay
             most = min(RANGES["latency_s"][1], 4 * task.control_period_s)
             ends[self.names.index("latency_s"), 1] = most
         self._ratio = np.array([item.ratio for item in self.parameters], np.bool_)
@@ -109,7 +109,7 @@ class Coordinates:
 
     @property
     def useful(self) -> F64:
-        """Return the half widths (n,) in z above which an interval says too little to be of use."""
+        """Return the largest half widths (n,) in z of useful intervals."""
         return np.array([item.useful for item in self.parameters]) / self._span
 
     def values(self, z: F64) -> F64:
@@ -125,7 +125,7 @@ class Coordinates:
 
     def perturbation(self, z: F64) -> Perturbation:
         """Return the perturbation at a point (n,)."""
-        # Rounded so that equal points are equal, and ends of ranges are within them.
+        # Rounded so that equal points give equal perturbations, and ends of ranges stay inside.
         values = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
         return msgspec.structs.replace(BASE, **values)
 
@@ -139,13 +139,13 @@ class Coordinates:
         return moved
 
     def without(self, name: str) -> Coordinates:
-        """Return these coordinates without one parameter, which stays as in `BASE`."""
+        """Return these coordinates without one parameter, which then has the value of `BASE`."""
         return Coordinates([other for other in self.names if other != name], self.task)
 
 
 @dataclass(frozen=True)
 class FitScope:
-    """Parameters and channels that a log can identify, and the reasons why not the others."""
+    """The parameters and channels that a log can identify, and the reasons against the others."""
 
     names: tuple[str, ...]
     channels: tuple[str, ...]
@@ -160,12 +160,12 @@ def fit_scope(
     recordings: Sequence[str],
     robot: Robot | None = None,
 ) -> FitScope:
-    """Return which of `names` these recordings (all by default) can identify at all.
+    """Return which of `names` these recordings can identify at all; no recordings means all.
 
-    `robot` is the profile's own; None: the twin's stand-in stands for the log's.
+    `robot` is the profile's; None: the twin drives its stand-in for the log's robot.
 
     Raises:
-        ConfigError: nothing.
+        ConfigError: they can identify none of the parameters.
     """
     refused: dict[str, str] = {}
     notes: list[str] = []
@@ -239,7 +239,7 @@ def _recording_filter(recordings: Sequence[str]) -> str:
 
 
 def pose_is_odometry(store: Store, recordings: Sequence[str]) -> bool:
-    """Return whether these recordings were read with odometry but without a localiser's topic."""
+    """Return whether all these recordings were read with odometry but without a localiser."""
     wanted = _recording_filter(recordings)
     rows = store.sql(
         "SELECT recording_id, coalesce(list(DISTINCT type) FILTER (decoded > 0), [])"
@@ -251,11 +251,11 @@ def pose_is_odometry(store: Store, recordings: Sequence[str]) -> bool:
     )
 
 
-_KEPT = 512  # replays of single perturbations that are kept
-ENOUGH = 0.02  # of the cost: what a parameter costs a fifth of its standard deviation away
-FREE = 0.01  # of the regulariser, where the Hessian's diagonal is about 1
-SOFT = 2.0  # noises from which on a residual counts by its size
-# Least noise of each channel: an exact simulator's residuals are those of the timestep.
+_KEPT = 512  # replays that are cached
+ENOUGH = 0.02  # gain in cost that ends the solver: that of a fifth of a standard deviation
+FREE = 0.01  # regulariser up to which a step is hardly held back, as the Hessian's diagonal is ~1
+SOFT = 2.0  # residuals above this many noises count linearly
+# Lower limits of the noise. Residuals of an exact simulator come from the timestep alone.
 LEAST = {
     "wheel speed": 0.001,
     "wheel yaw rate": 0.003,
@@ -266,10 +266,10 @@ LEAST = {
 
 
 class ReplayResiduals:
-    """Residuals (prediction less log) of any perturbation on one set of segments.
+    """Residuals (replay less log) of any perturbation on one set of segments.
 
     Args:
-        channels: of `CHANNELS`, those the recording can be trusted in.
+        channels: those of `CHANNELS` to compare.
     """
 
     def __init__(
@@ -283,7 +283,7 @@ class ReplayResiduals:
         self._known: dict[Perturbation, dict[str, F64]] = {}
 
     def of(self, perturbations: Sequence[Perturbation]) -> dict[str, F64]:
-        """Return residuals by channel, (P, S, R) each: R is K + 1, or 2 (K + 1) for a position."""
+        """Return residuals by channel, (P, S, R) each; R is K + 1, or 2 (K + 1) for positions."""
         parts = [self._between(perturbation) for perturbation in perturbations]
         self._drive([twin for pair in parts for twin, weight in pair if weight])
         residuals = {
@@ -301,7 +301,7 @@ class ReplayResiduals:
         return residuals
 
     def _between(self, perturbation: Perturbation) -> list[tuple[Perturbation, float]]:
-        """Return the replays whose weighted mean stands for a perturbation, with their weights."""
+        """Return two replays with weights, whose weighted mean interpolates the latency."""
         ticks = perturbation.latency_s / BASE.timestep_s
         low = int(np.floor(ticks + 1e-6))
         above = max(ticks - low, 0.0)
@@ -324,7 +324,7 @@ class ReplayResiduals:
 
 
 def channel_residuals(segments: LoggedSegments, replayed: OpenLoopResult) -> dict[str, F64]:
-    """Return every channel's residuals, (P, S, R) each; 0 if the log has no value."""
+    """Return every channel's residuals, (P, S, R) each; 0 for poses that are not fresh."""
     predicted, logged = replayed.signals, segments.signals
     residuals = {
         "wheel speed": predicted["wheel_speed_mps"] - logged["wheel_speed_mps"],
@@ -349,7 +349,7 @@ def channel_residuals(segments: LoggedSegments, replayed: OpenLoopResult) -> dic
 
 
 def position_gap_m(segments: LoggedSegments, replayed: OpenLoopResult) -> F64:
-    """Return the twin's distance from the logged position, (P, S, K + 1), after a common pose."""
+    """Return the distance between twin and log, (P, S, K + 1), after starting at the same pose."""
     gap: F64 = np.hypot(
         replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],
         replayed.signals["pose_y_m"] - segments.signals["pose_y_m"],
@@ -376,20 +376,20 @@ def cost(r: F64) -> F64:
 
 
 def weights(r: F64) -> F64:
-    """Return each residual's weight: the norm's derivative is weight times residual."""
+    """Return the weight of each residual: the cost's derivative over the residual."""
     return np.asarray(1 / np.sqrt(1 + (r / SOFT) ** 2))
 
 
 @dataclass(frozen=True)
 class FitSolution:
-    """The end point of a search, with what its uncertainty and warnings are computed from."""
+    """The result of a search, and the data for its uncertainty and warnings."""
 
     coordinates: Coordinates
     z: F64  # (n,)
     residual: F64  # (R,) in units of noise
     jacobian: F64  # (R, n)
-    segment: NDArray[np.int64]  # (R,) of the residual
-    scale: dict[str, float]  # noise of each channel, its correlation along the segment included
+    segment: NDArray[np.int64]  # (R,) of each residual
+    scale: dict[str, float]  # channel -> noise, including its correlation along segments
     converged: bool
 
 
@@ -418,13 +418,13 @@ class FitProblem:
         """Return difference quotients (R, n) at z (n, 1), with latency in whole physics steps.
 
         A wheel starts to slide at a physics step, so wheel speeds jump as friction or payload
-        change. A jump is not a slope: for these two, quotients are taken to both sides. The smaller
-        one counts, or none if their signs differ.
+        change. A jump is not a slope, so for these two, quotients are taken on both sides. The
+        smaller one is used, or 0 if their signs differ.
         """
-        del residual  # it is between two latencies; this is at one
+        del residual  # it is at an interpolated latency, but this is at a whole step
         size, steps = len(self.coordinates), self.coordinates.steps
         at = self.coordinates.drivable(z.reshape(-1))
-        # Of the latency, to the side on which z lies: residuals are interpolated there.
+        # For latency, the quotient is on the side of z, where residuals are interpolated.
         forward = (at + steps <= 1.0) & (z.reshape(-1) >= at - 1e-9)
         forward |= at - steps < 0.0
         step = np.where(forward, steps, -steps)
@@ -444,8 +444,8 @@ class FitProblem:
 
 
 def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
-    """Return the best (best, n) of the base and `points` points of a Sobol sequence."""
-    from scipy.stats import qmc  # here: it is slow to import
+    """Return the best points (best, n) among the base and `points` of a Sobol sequence."""
+    from scipy.stats import qmc  # imported here because it is slow to import
 
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)
     drawn = sampler.random(points) if points else np.zeros((0, len(problem.coordinates)))
@@ -457,13 +457,13 @@ def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
 
 
 def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float, bool]:
-    """Solve least squares from a start (n,); return the solution, its cost, and if it converged."""
+    """Solve least squares from `start` (n,); return solution, cost, and whether it converged."""
     size = len(problem.coordinates)
     steps: list[minimize.IterLog] = []
 
     def watch(trace: list[minimize.IterLog]) -> None:
         steps[:] = trace
-        free = trace[-1].regularizer <= FREE  # a held back step gains little anywhere
+        free = trace[-1].regularizer <= FREE  # a step that is held back always gains little
         if free and 0 < trace[-1].reduction < ENOUGH and len(trace) > 1:
             raise _GoodEnough
 
@@ -490,14 +490,14 @@ def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float,
 
 
 class _GoodEnough(Exception):
-    """Stops the solver if a step gained less than a log can resolve."""
+    """Raised to stop the solver once a step gains less than a log can resolve."""
 
 
 def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
     """Return each channel's noise, from residuals (1, S, R) at a solution.
 
-    It is the median deviation, scaled for the correlation of neighbouring steps: n residuals with
-    correlation c count as much as n (1 - c) / (1 + c) independent ones.
+    It is the median deviation, scaled up for the correlation c of neighbouring steps: n residuals
+    count as much as n (1 - c) / (1 + c) independent ones.
     """
     scale = {}
     for name, residual in residuals.items():

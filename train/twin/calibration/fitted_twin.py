@@ -1,8 +1,8 @@
 """The result of a fit: parameters, how well a log identifies them, and TOML for training.
 
-Intervals come from a bootstrap over episodes and from profiles of the cost. For each parameter, the
-value is reported with its interval, or the reason why it keeps the base's value. One fit makes a
-perturbation; several, of recordings of robots that differ, a schedule over them.
+Intervals come from a bootstrap over episodes and from profiles of the cost. Each parameter is
+reported with its interval, or with the reason why it keeps the base's value. One fit makes a
+perturbation. Several fits, to recordings of different robots, make a schedule.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ParameterEstimate:
     value: float
     low: float | None
     high: float | None
-    fitted: bool  # False: as in the base, for the reason that `note` gives
+    fitted: bool  # False: it has the base's value, for the reason in `note`
     note: str = ""
 
 
@@ -53,15 +53,15 @@ class HeldOutGap:
 
     horizon_s: float
     segments: int
-    before_m: float  # median over the segments, under the base
-    after_m: float  # under what was fitted
-    low_m: float  # 95 % of the latter, bootstrap over segments
+    before_m: float  # median over the segments, with the base
+    after_m: float  # the same with the fitted perturbation
+    low_m: float  # 95 % interval of `after_m`, from a bootstrap over segments
     high_m: float
 
 
 @dataclass(frozen=True)
 class FittedTwin:
-    """The twin with the parameters of a log's robot, as far as the log identifies them."""
+    """The parameters of a log's robot, as far as the log identifies them."""
 
     perturbation: Perturbation
     recordings: tuple[str, ...]
@@ -70,8 +70,8 @@ class FittedTwin:
     held_out: tuple[HeldOutGap, ...]
     noise: dict[str, dict[str, Any]]  # channel -> unit, before, after: median deviations
     segments: int  # that were fitted
-    clusters: int  # that uncertainty was drawn over
-    left_out: dict[str, int] = field(default_factory=dict)  # segments or steps, by reason
+    clusters: int  # number of units of the bootstrap
+    left_out: dict[str, int] = field(default_factory=dict)  # reason -> segments or steps
 
     def describe(self) -> dict[str, Any]:
         """Return the fit as plain values for JSON."""
@@ -103,7 +103,7 @@ class FittedTwin:
 def fleet_schedule(fits: Sequence[FittedTwin]) -> Schedule:
     """Return a schedule that draws each parameter between its smallest and largest fitted value.
 
-    A parameter that not every recording identified stays as in the base.
+    A parameter that some recording does not identify keeps the base's value.
     """
     fitted = [{item.name for item in fit.estimates if item.fitted} for fit in fits]
     shared = [
@@ -122,8 +122,8 @@ def write_fit(path: Path | str, fits: Sequence[FittedTwin]) -> None:
     """Write the perturbation of one fit, or the schedule of several, atomically.
 
     Raises:
-        ConfigError: there is something at `path`.
-        StoreError: it cannot be written there.
+        ConfigError: `path` already exists.
+        StoreError: `path` cannot be written.
     """
     text = fits[0].toml() if len(fits) == 1 else _schedule_toml(fits)
     try:
@@ -158,28 +158,29 @@ def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
 RESAMPLES = 1000
 FEW_CLUSTERS = 8
 PROFILE_POINTS = 12
-CHI_SQUARE_95 = 3.84  # of one degree of freedom
-SLIDES_MPS = 0.05  # a wheel faster than this over the floor slides
-CONFOUNDED = 0.95  # correlation of two estimates
+CHI_SQUARE_95 = 3.84  # with one degree of freedom
+SLIDES_MPS = 0.05  # a wheel slides if it is faster than this over the floor
+CONFOUNDED = 0.95  # correlation of two estimates from which to warn
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Uncertainty of n parameters, in coordinates of the unit cube."""
 
-    half: F64  # (n,) of the 95 % intervals; inf where the log says nothing
+    half: F64  # (n,) half widths of the 95 % intervals
     correlation: F64  # (n, n) of the estimates
-    clusters: int  # episodes, or segments where there are few episodes
+    clusters: int  # number of episodes, or of segments if there are few episodes
 
 
 def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: int) -> Uncertainty:
-    """Compute intervals by a bootstrap over episodes (S,), linearised at the solution.
+    """Compute intervals by a bootstrap over episodes, linearised at the solution.
 
-    Steps of a segment and segments of an episode err together (localisation drifts), so whole
-    episodes are drawn; with fewer than 8 of them, segments. Each draw moves the parameters by one
-    Gauss-Newton step of its own residuals; half widths are Student's t times the spread of that.
+    `episode` (S,) is the episode of each segment. Errors within an episode are correlated, as
+    localisation drifts, so whole episodes are drawn; with fewer than 8 episodes, segments are. Each
+    draw moves the parameters by the Gauss-Newton step of its residuals. Half widths are Student's t
+    times the spread of these steps.
     """
-    from scipy.stats import t as student  # here: it is slow to import
+    from scipy.stats import t as student  # imported here because it is slow to import
 
     names = np.unique(episode)
     by_segment = len(names) < FEW_CLUSTERS
@@ -197,10 +198,10 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
         hessian[index] = part.T @ (weight[rows, None] * part)
     useful = solution.coordinates.useful
     whole = hessian.sum(axis=0)
-    inside = (solution.z > 1e-9) & (solution.z < 1 - 1e-9)  # at an end the gradient may stay
+    inside = (solution.z > 1e-9) & (solution.z < 1 - 1e-9)  # at an end the gradient need not be 0
     gradient = np.where(inside, gradient - gradient.mean(axis=0), gradient)
 
-    # A parameter without any information would make every other infinite: a hair's breadth of it.
+    # A tiny ridge: else a parameter without information would make all intervals infinite.
     ridge = np.diag(1e-6 / useful**2)
     rng = np.random.Generator(np.random.PCG64(seed))
     drawn = cluster_counts(count, RESAMPLES, rng)
@@ -210,7 +211,7 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     spread = 1.4826 * np.median(np.abs(moved - np.median(moved, axis=0)), axis=0)
     inverse = np.linalg.inv(whole + ridge)
     deviation = np.sqrt(np.diag(inverse))
-    # A bootstrap of residuals that do not move with a parameter has no spread either.
+    # The bootstrap has no spread if residuals do not depend on a parameter: use the larger of both.
     half = student.ppf(0.975, max(count - 1, 1)) * np.maximum(spread, deviation)
     return Uncertainty(
         half=half,
@@ -222,8 +223,8 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
 def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tuple[float, float]:
     """Return the range of z (low, high) in which a parameter explains the log within 95 %.
 
-    The parameter is set to values over its whole range. At each value the others make one
-    Gauss-Newton step, and twice the rise of the cost is compared with chi-square.
+    The parameter is set to values over its whole range. At each value the other parameters make one
+    Gauss-Newton step, and twice the increase of the cost is compared with chi-square.
     """
     grid = np.sort(np.append(np.linspace(0.0, 1.0, PROFILE_POINTS), solution.z[index]))
     points = np.tile(solution.z[:, None], (1, len(grid)))
@@ -244,7 +245,7 @@ def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tupl
 
 
 def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
-    """Return where the cost passes chi-square between a point that fits and one that does not."""
+    """Return the z at which the cost passes chi-square, next to the outermost point that fits."""
     outer = inner + way
     if not 0 <= outer < len(grid):
         return float(grid[inner])
@@ -257,7 +258,8 @@ def unidentified(
 ) -> ParameterEstimate | None:
     """Return the least identified parameter among those to keep at base; None if there is none.
 
-    A parameter stays at base if it is poorly identified and its base value fits the log as well.
+    A poorly identified parameter is kept at base if the base value fits the log as well, or if the
+    parameter has no effect at the end of its range.
     """
     width = uncertainty.half / solution.coordinates.useful
     for index in np.argsort(-width):
@@ -271,7 +273,7 @@ def unidentified(
 def _kept_as_in_base(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty, index: int
 ) -> ParameterEstimate | None:
-    """Return a poorly identified parameter at its base value, with the reason; else None."""
+    """Return a poorly identified parameter at base, with the reason; None if it is to be fitted."""
     coordinates = solution.coordinates
     parameter = coordinates.parameters[index]
     problem = FitProblem(residuals, coordinates, solution.scale)
@@ -279,8 +281,8 @@ def _kept_as_in_base(
     ends = [_value(solution, index, end) for end in (low, high)]
     start = coordinates.point(BASE)[index]
     base_fits = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
-    # At an end of its range, and the residuals there do not move with it: where it got to is the
-    # search's doing, whatever the jumps of the cost on the way to the base say.
+    # At an end of its range, where residuals do not depend on it, the value is an accident of the
+    # search, even if the cost jumps on the way from there to the base.
     lost = uncertainty.half[index] > 1 and not 1e-9 < solution.z[index] < 1 - 1e-9
     if not base_fits and not lost:
         return None
@@ -302,7 +304,7 @@ def _kept_as_in_base(
 
 
 def _confounded_with(correlation: F64, index: int) -> int | None:
-    """Return the parameter that this one is most confounded with, or None."""
+    """Return the parameter with the highest correlation with this one; None below 0.8."""
     others = np.abs(correlation[index]).copy()
     others[index] = 0.0
     at = int(np.argmax(others)) if len(others) > 1 else index
@@ -312,7 +314,7 @@ def _confounded_with(correlation: F64, index: int) -> int | None:
 def as_in_base(
     name: str, reason: str, low: float | None = None, high: float | None = None
 ) -> ParameterEstimate:
-    """Return a parameter that is not fitted."""
+    """Return the estimate of a parameter that keeps the base's value, for this reason."""
     value, unit = float(getattr(BASE, name)), PARAMETERS[name].unit
     return ParameterEstimate(name, unit, value, low, high, False, reason)
 

@@ -1,19 +1,18 @@
 """The gap between the twin and a store's logs, per condition, before and after calibration.
 
-Paths: logged commands driven again open loop (`path_gap`). Steps: one control period from each
-logged state, through the task's own observation and reward. Each statistic is a row with its
-interval over episodes; verdicts are computed from them (`twin_gap`). What a store's signals do not
-allow is listed in `TwinGap.not_done`.
+Two things are measured. Paths: logged commands are driven again open loop (`path_gap`). Steps: the
+twin drives one control period from each logged state, and the task's observations and rewards are
+compared. Each statistic is a row with its interval over episodes, and verdicts are computed from
+the rows (`twin_gap`). `TwinGap.not_done` lists what a store's signals do not allow.
 
-For a step the twin is put into the logged state (pose, motion, and what its base controller made of
-the commands before) and drives the logged action for one control period. There is no sensor noise,
-and pallets, people and patches of the log are unknown to it.
+For a step, the twin is put into the logged state (pose, motion, and the state of the base
+controller after the commands before) and drives the logged action for one control period. It has no
+sensor noise, and none of the log's pallets, people and slippery patches.
 
-A store keeps no plans, but every row keeps two points of its plan (the look-ahead points) and how
-much of it remained. In the map frame those points lie on the plan, each with a known length to its
-end, so the rows that were driven under one plan restore most of it: from 1 m ahead of where it was
-first seen to 2.2 m ahead of where it was last seen. This is enough for another pose near the logged
-one.
+A store keeps no plans, but every row has two points of its plan (the look-ahead points) and the
+plan's remaining length. These points lie on the plan, with a known length from each to its end. So
+the rows that were driven under one plan restore most of it: from 1 m ahead of its first row to
+2.2 m ahead of its last row. This is enough for a pose near the logged one.
 """
 
 from __future__ import annotations
@@ -80,9 +79,9 @@ from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
 
 PAST = 5  # control periods of commands before the step: longer than any latency and ramp
-AGREES = 0.05  # of a clearance entry: about what noise and a pallet here and there make
-SAME_M = 1e-3  # what remains of a plan is stored as float32
-SPACING_M = 0.02  # points nearer to each other than this give no direction
+AGREES = 0.05  # largest difference of clearance entries on one floor: noise and a few pallets
+SAME_M = 1e-3  # tolerance of a plan's remaining length, which is stored as float32
+SPACING_M = 0.02  # points closer to each other give no direction
 ROUTE = (
     *("waypoint_near_x_m", "waypoint_near_y_m", "waypoint_far_x_m", "waypoint_far_y_m"),
     "route_remaining_m",
@@ -91,7 +90,7 @@ ROUTE = (
 
 @dataclass(frozen=True)
 class StepResult:
-    """Signals after n steps, in the log or in a twin."""
+    """Observations and rewards of n steps, in the log or in a twin."""
 
     observation: F32  # (n, D) at t + 1
     reward: F64  # (n,)
@@ -100,15 +99,15 @@ class StepResult:
 
 @dataclass(frozen=True)
 class OneStep:
-    """n steps, as logged and as P twins drove them."""
+    """n steps, as logged and as each twin drove them."""
 
-    rows: Ints  # (n,) of the logged steps
+    rows: Ints  # (n,) indices in the logged steps
     now: F32  # (n, D) the logged observation at t
     logged: StepResult
     twins: dict[str, StepResult]
     valid: Bools  # (n,) no twin diverged
-    lidar: bool  # the floor is the twin's: otherwise lidar entries are the log's own
-    unexplained: int  # logged rewards that their terms do not add up to
+    lidar: bool  # the floor is known; if not, lidar entries are copied from the log
+    unexplained: int  # number of logged rewards that are not the sum of their terms
 
 
 def one_step(
@@ -120,13 +119,13 @@ def one_step(
     warehouse: Warehouse | None,
     config: GapConfig,
 ) -> OneStep:
-    """Compare `rows` (n,), each of which must have a known next step.
+    """Compare one step of the twins from each of `rows` (n,), whose next step must be known.
 
-    `warehouse` is the floor of the log; without one the floor is empty, and what the lidar sees is
+    `warehouse` is the floor of the log. If it is None, the floor is empty, and lidar readings are
     not compared.
 
     Raises:
-        ConfigError: a timestep or control period that the twin cannot keep.
+        ConfigError: the twin cannot keep the timestep or control period.
     """
     task = steps.task
     observed, next_observed = observations(store, steps.transition_id[rows], task.observation_size)
@@ -141,7 +140,7 @@ def one_step(
 
     logged_terms = terms(after, steps.progress_m[rows])
     summed = np.asarray(sum(logged_terms.values()))
-    # Terms of the task's own may look farther back than a step: the others are compared.
+    # Custom reward terms may need earlier steps, so that only the built-in terms are compared.
     earned = summed if task.reward_terms else steps.reward[rows]
     logged = StepResult(next_observed, earned, logged_terms)
     adds_up = np.abs(summed - earned) < 1e-3
@@ -171,7 +170,7 @@ def one_step(
         own = len(task.observed or ())
         twin[OBSERVED] = np.zeros((len(rows), own))
         seen = observe(task, twin, now, action)
-        # What needs the steps before is as logged: not compared.
+        # Entries that need earlier steps are copied from the log, so they are not compared.
         first = task.observation_size - 6 * (task.tracks or 0) - own
         seen[:, first:] = next_observed[:, first:]
         results[name] = StepResult(seen, reward, parts)
@@ -187,7 +186,7 @@ def one_step(
 
 
 def _sensed(driven: OpenLoopResult, twin: int) -> Signals:
-    """Return the signals that one twin senses at the end, by name."""
+    """Return the signals of one twin at the end of the drive, by name."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]
     return sensed | {"bumped": driven.bumped[twin]}
@@ -211,8 +210,8 @@ def _localise(period_s: float, now: Signals, after: Signals, twin: Signals) -> N
 def agreement(steps: LoggedSteps, store: Store, rows: Ints, warehouse: Warehouse) -> float:
     """Return how far the lidar at `rows` (n,) differs from what it would see on this floor, 0 to 1.
 
-    The median over the rows of the mean difference of the observation's clearance entries, which
-    run from 0 (touching) to 1 (nothing within range). Below `AGREES` the floor is the log's.
+    It is the median over the rows of the mean difference of the observation's clearance entries,
+    which go from 0 (touching) to 1 (nothing within range). Up to `AGREES` the floor is the log's.
     """
     task = steps.task
     observed, _ = observations(store, steps.transition_id[rows], task.observation_size)
@@ -233,15 +232,15 @@ class PlanMemory:
     """The plans of N logged steps."""
 
     task: Task
-    routing: Routing  # `plan` (N,) is what was in force at t
-    next_plan: Ints  # (N,) at t + 1
-    error_m: float  # of what remains, seen on the rebuilt plans from the logged poses, median
+    routing: Routing  # its `plan` (N,) is the index of the plan at t
+    next_plan: Ints  # (N,) the index at t + 1
+    error_m: float  # median error of the remaining length on the rebuilt plans
 
     def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> dict[str, F64]:
         """Return the route's signals at t + 1 as seen from other poses (n,), for `rows` (n,).
 
-        They are the logged ones plus the difference that the rebuilt plan gives between the two
-        poses. If the poses are close, so are the errors of the rebuilt plan.
+        They are the logged signals plus the difference between the two poses on the rebuilt plan.
+        If the poses are close, the errors of the rebuilt plan cancel.
         """
         after = rows_of(steps.after, rows)
         moved = self._view(self.next_plan[rows], pose)
@@ -264,7 +263,7 @@ class PlanMemory:
 
 
 def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
-    """Rebuild the plans of all rows; None if the task has no route."""
+    """Rebuild the plans of all rows; there are none if the task has no route."""
     count = len(steps)
     if steps.task.goal != "route":
         nowhere = np.full(count, -1, np.int64)
@@ -285,7 +284,7 @@ def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
 
 
 def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
-    """Rebuild the polyline (P, 2) of rows [begin, end) that saw one plan."""
+    """Rebuild the polyline (P, 2) of the plan that rows [begin, end) have in common."""
     rows = slice(begin, end)
     x, y = steps.now["pose_x_m"][rows], steps.now["pose_y_m"][rows]
     yaw, remaining = steps.now["pose_yaw_rad"][rows], steps.now["route_remaining_m"][rows]
@@ -306,7 +305,7 @@ def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
     if len(line) == 1:
         ahead_of = np.array([np.cos(yaw[0]), np.sin(yaw[0])])
         return np.stack([line[0], line[0] + ahead_of * max(rest, SPACING_M)])
-    if rest > 0:  # not seen to its end: straight on, for the length that remains
+    if rest > 0:  # its end was never seen: continue straight for the remaining length
         way = line[-1] - line[-2]
         way = way / max(float(np.hypot(*way)), 1e-9)
         line = np.concatenate([line, (line[-1] + way * rest)[None]])
@@ -314,7 +313,7 @@ def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
 
 
 BEFORE, AFTER, PERSISTENCE = "nominal", "calibrated", "persistence"
-_FLOOR_ROWS = 200  # nominal rows whose lidar says whether the floor is the twin's
+_FLOOR_ROWS = 200  # nominal rows whose lidar is compared with the twin's floor
 
 
 def measure_gap(
@@ -327,13 +326,13 @@ def measure_gap(
 ) -> TwinGap:
     """Measure the gap of the nominal twin and, if given, of a calibrated one.
 
-    What the lidar sees is compared only if the log was driven on the twin's own floor.
+    Lidar readings are compared only if the log was driven on the twin's default floor.
 
     Raises:
-        ConfigError: a horizon that is not some control periods, or a control period that the twin
-            cannot keep.
-        StoreError: no rows, rows of several tasks and no `task_hash`, or no row that is followed
-            by another.
+        ConfigError: a horizon is not a multiple of the control period, or the twin cannot keep the
+            control period.
+        StoreError: there are no rows, there are rows of several tasks but no `task_hash`, or no row
+            has a next step.
     """
     config, warehouse = config or GapConfig(), default_warehouse()
     report = on_progress or (lambda text: None)
@@ -395,7 +394,7 @@ def _floor_difference(
 def _steps_to_compare(
     steps: LoggedSteps, most: int, rng: np.random.Generator
 ) -> tuple[Ints, dict[str, Bools]]:
-    """Draw at most `most` rows of each condition; return rows, and which count for which."""
+    """Draw at most `most` rows per condition; return the rows, and a mask of them by condition."""
     masks = {}
     for name, holds in steps.conditions.items():
         mask, members = np.zeros(len(steps), np.bool_), np.flatnonzero(holds & steps.followed)
@@ -406,7 +405,7 @@ def _steps_to_compare(
 
 
 def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """Return the median and 90th percentile of each quantity, by condition, horizon and source."""
+    """Yield the median and 90th percentile of each quantity, by condition, horizon and source."""
     for path in paths:
         for condition, mask in path.holds.items():
             for (source, quantity), values in path.gaps.items():
@@ -429,10 +428,10 @@ def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[
 def _observation_rows(
     steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Return the mean absolute gap of each observation component that depends on the twin."""
+    """Yield the mean absolute gap of each observation component that depends on the twin."""
     sources = {name: result.observation for name, result in stepped.twins.items()}
     sources |= {PERSISTENCE: stepped.now}
-    # The action that was applied, and what the log's own navigation proposed.
+    # These are copied from the log: the applied action, and the proposals of its navigation.
     left_out = ["previous_action_", "nav_"]
     left_out += [] if stepped.lidar else ["clearance_", "closing_"]
     left_out += [] if steps.task.goal == "route" else ["near_", "far_", "goal_"]
@@ -456,10 +455,11 @@ def _observation_rows(
 def _reward_rows(
     steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
 ) -> tuple[Rows, dict[tuple[str, str], ConfidenceInterval]]:
-    """Return gaps by term, and the whole gap over the reward's spread by condition and source.
+    """Return the gaps by term, and the ratio of the reward's gap to its spread.
 
-    The spread is the distance of a step's reward from the median, and at least a step's cost:
-    standing still earns the same at every step, and compared with that any gap would be large.
+    The ratio is by condition and source. The spread is the mean distance of a step's reward from
+    the median, with the cost of a step as its minimum: rewards of a robot that stands are all
+    equal, so that any gap would be large compared with their spread.
     """
     rows_by_term, ratios = [], {}
     least = abs(steps.task.rewards.step)

@@ -1,9 +1,9 @@
 """A store's steps for comparison with the twin: each row, and the step after it.
 
-The store is the interface: one row a step, sensed as training senses it, so what is compared with
-a twin (and a latency that is fitted) counts from the observation at a tick, as in training. A row
-holds its signals at t; those at t + 1 are the next row's, or, at an episode's end, those of the
-step that only ends it, which the store keeps in its files' metadata.
+A store has one row per step, sensed as in training. So comparisons with a twin, and fitted
+latencies, start from the observation at a tick, as in training. A row has its signals at t. Those
+at t + 1 are in the next row or, at an episode's end, in the step that only ends the episode, which
+the store keeps in its files' metadata.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class LoggedSteps:
     recording_id: Strings  # (N,)
     episode_id: Strings  # (N,)
     step_index: Ints  # (N,) in its episode
-    begins: Bools  # (N,) the row before is not the step before: another episode, or steps between
+    begins: Bools  # (N,) the step before is not in the row before: new episode, or missing steps
     condition: Strings  # (N,) the label
-    true_condition: Strings  # (N,) of a simulator; "" where not known
-    conditions: dict[str, Bools]  # name -> (N,) it holds; `nominal` where none does
+    true_condition: Strings  # (N,) of a simulator; "" if unknown
+    conditions: dict[str, Bools]  # name -> (N,) whether it holds; `nominal` if no other does
     action: Ints  # (N,)
     reward: F64  # (N,)
     progress_m: F64  # (N,)
-    ending: Ints  # (E,) rows whose successor only ends their episode
-    ends: Signals  # the signals of those successors, (E,) each
-    robot: RobotModel | None = None  # that was driven; None: the twin's stand-in
+    ending: Ints  # (E,) indices of rows whose successor only ends the episode
+    ends: Signals  # the signals of these successors, (E,) each
+    robot: RobotModel | None = None  # of the profile; None: the twin's stand-in
 
     def __len__(self) -> int:
         return len(self.transition_id)
@@ -77,14 +77,14 @@ class LoggedSteps:
 
     @cached_property
     def first(self) -> Ints:
-        """Return the first row (N,) of each row's stretch of consecutive steps."""
+        """Return the index (N,) of the first row of each row's stretch of consecutive steps."""
         first: Ints = np.maximum.accumulate(np.where(self.begins, np.arange(len(self)), 0))
         return first
 
     def commands(self, rows: Ints, before: int, count: int) -> F64:
-        """Return commands (m/s, rad/s) from `before` steps before `rows` (n,) on.
+        """Return the commands of `before` steps before `rows` (n,) and of `count` steps from there.
 
-        (n, before + count, 2). Before a stretch begins: stop.
+        Returns m/s and rad/s, (n, before + count, 2). Before a stretch begins, commands are 0.
         """
         steps = rows[:, None] + np.arange(-before, count)
         commands = np.stack([self.now[name] for name in COMMAND], axis=-1)
@@ -100,8 +100,9 @@ def logged_steps(
     """Read the rows of a task from these recordings of a store (all by default).
 
     Raises:
-        ConfigError: no such recording, or a robot that the twin cannot build.
-        StoreError: no rows, rows of several tasks and no `task_hash`, or columns are missing.
+        ConfigError: there is no such recording, or the twin cannot build the robot.
+        StoreError: there are no rows, there are rows of several tasks but no `task_hash`, or
+            columns are missing.
     """
     task = store.task(task_hash)
     robot = robot_of_store(store, task_hash or task.hash)
@@ -149,11 +150,11 @@ def logged_steps(
 
 
 def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
-    """Return the ids of a store's recordings of a task, or those among the requested ones.
+    """Return the IDs of a store's recordings with rows of a task, or check and return `wanted`.
 
     Raises:
-        ConfigError: one that is wanted is not there.
-        StoreError: no rows, or rows of several tasks and no `task_hash`.
+        ConfigError: a wanted recording has no rows of the task.
+        StoreError: there are no rows, or rows of several tasks but no `task_hash`.
     """
     task_hash = task_hash or store.task().hash
     store.task(task_hash)
@@ -187,7 +188,7 @@ def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32
 def sector_clearance(task: Task, observation: F32) -> F64:
     """Invert observations (n, D) to sector clearances (n, sectors) in metres.
 
-    Those beyond the task's range read as its range: an observation does not tell them apart.
+    Clearances beyond the task's range come out as its range, as observations are clipped there.
     """
     if not task.lidar:
         return np.zeros((len(observation), 0))
@@ -207,7 +208,7 @@ def previous_action(task: Task, observation: F32) -> Ints:
 
 
 def rows_of(columns: Signals, rows: NDArray[Any]) -> Signals:
-    """Return these rows of every column."""
+    """Select these rows of every column."""
     return {name: column[rows] for name, column in columns.items()}
 
 
@@ -221,7 +222,7 @@ def _conditions(held: Sequence[Sequence[str] | None]) -> dict[str, Bools]:
 def _ends(
     store: Store, recordings: Sequence[str], episode: Strings, step: Ints, last: Bools
 ) -> tuple[Ints, Signals]:
-    """Return which `last` rows (N,) of stretches an episode end follows, and those ends."""
+    """Return the `last` rows (N,) of stretches that an episode's end follows, and its signals."""
     row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
     rows, parts = [], []
     for recording, ends in store.episode_ends(recordings):
@@ -253,16 +254,16 @@ def _vectors(column: pa.ChunkedArray, size: int) -> F32:
 
 
 def robot_of_store(store: Store, task_hash: str) -> Robot | None:
-    """Return the robot of the newest profile that read a task's rows, or None.
+    """Return the robot of the newest readable profile that a task's rows were ingested with.
 
-    It is None if the profile has no robot, or if an older Restock kept no profile.
+    None if this profile has no [robot], or if there is no such profile.
     """
     for stored in profiles_of(store.connection, task_hash):
         if not stored.toml:
             continue
         try:
             profile = parse_profile(stored.toml, where=str(store.path))
-        except ConfigError:  # of another version: as if it were not there
+        except ConfigError:  # written by another version: ignored
             continue
         return profile.robot
     return None

@@ -1,4 +1,4 @@
--- One row a step of a task, in the order it was driven; `{signals}` are the stored signals.
+-- The rows (steps) of a task, in the order of driving; `{signals}` are the stored signals.
 SELECT
     transition_id,
     recording_id,

@@ -1,14 +1,15 @@
 """Open loop: replay logged commands in the twin, without other information from the log.
 
-`drive_open_loop` puts robots into logged states and drives logged commands from there, one control
-period or many. `replay_segments` drives segments of a log with it: the W steps before a segment
-begin with the logged motion, and are driven only so that ramps and late commands are under way when
-the K steps begin. Then the twin's pose is set to the logged pose, and the twin drives on its own.
-Without a floor map the floor is empty. Obstacles of a log are unknown, racks of another floor do
+`drive_open_loop` puts robots into logged states and drives logged commands from there, for one or
+more control periods. `replay_segments` uses it for segments of a log. A warm-up of W steps begins
+with the logged motion, so that ramps and delayed commands are under way when the K steps of the
+segment begin. There the twin's pose is set to the logged one, and the twin drives on its own.
+
+Segments are driven on an empty floor. The log's obstacles are unknown, racks of another floor do
 not apply, and a localisation error of 3 cm must not become a collision: the question is how the
-robot moves, and steps with contact are marked by the signal `bumped`. Slippery patches are unknown,
-too. Without obstacles the motion does not depend on where it begins, so robots are driven in the
-middle of an empty hall, and their paths laid onto the map.
+robot moves, and the log's signal `bumped` marks steps with contact. Slippery patches are unknown,
+too. Without obstacles the motion does not depend on the place, so robots drive in the middle of an
+empty hall, and their paths are moved onto the map.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import Simulation
 
-WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
-STILL_MPS = 0.02  # slower than this a robot stands
-TOUCHING_M = 0.05  # nearer to something than this a robot may be touching it
-EVEN = 0.25  # of a control period: how far a tick or a pose may be from where it should be
+WARMUP_S = 1.0  # longer than any latency, and than stopping with friction .2
+STILL_MPS = 0.02  # a slower robot stands
+TOUCHING_M = 0.05  # a robot closer to something may be touching it
+EVEN = 0.25  # of a control period: tolerance of the times of ticks and poses
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 MOTION = (
     *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2"),
@@ -54,24 +55,23 @@ LOGGED = ("stamp_ns", "pose_stamp_ns", *POSE, *MOTION, *COMMAND, "bumped", "clea
 class LoggedSegments:
     """S logged segments of K steps, with the W steps before each.
 
-    `signals` are the stored signals by name, (S, K + 1): at the K ticks and at the end of the
-    last. `left_out` counts the steps that begin no segment although they are of the store, by
-    reason.
+    `signals` are the stored signals by name, (S, K + 1), at the K ticks and at the end of the last
+    step. `left_out` counts the store's steps at which no segment begins, by reason.
     """
 
     task: Task
-    robot: RobotModel | None  # whose logs they are; None: the twin's stand-in
+    robot: RobotModel | None  # of the log's profile; None: the twin's stand-in
     horizon_steps: int  # K
     warmup_steps: int  # W
-    row: Ints  # (S,) of the first of the K steps, in the `LoggedSteps`
-    transition_id: Ints  # (S,) likewise
+    row: Ints  # (S,) index of the first of the K steps in the `LoggedSteps`
+    transition_id: Ints  # (S,) of this step
     recording_id: NDArray[np.str_]  # (S,)
     episode_id: NDArray[np.str_]  # (S,)
     condition: NDArray[np.str_]  # (S, K) the label of each step
-    true_condition: NDArray[np.str_]  # (S, K) of a simulator; "" where not known
-    command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; stop where nothing was before
-    still: NDArray[np.bool_]  # (S,) the robot stood before the first of the W steps
-    before: dict[str, F64]  # the signals of `BEFORE` as the W steps begin, (S,) each
+    true_condition: NDArray[np.str_]  # (S, K) of a simulator; "" if unknown
+    command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; 0 before an episode begins
+    still: NDArray[np.bool_]  # (S,) some of the W steps are missing, but the robot stood there
+    before: dict[str, F64]  # the signals of `BEFORE` when the W steps begin, (S,) each
     signals: Signals  # (S, K + 1) each
     pose_fresh: NDArray[np.bool_]  # (S, K + 1) the pose was measured at its tick
     left_out: dict[str, int] = field(default_factory=dict)
@@ -104,14 +104,14 @@ def log_segments(
 ) -> LoggedSegments:
     """Cut logged episodes into segments of `horizon_s`.
 
-    A segment begins `stride_s` (default: the horizon, so that none overlap) after the one before
-    or at the first tick from there on where its steps and those of the warm-up (rounded up to whole
-    steps) are all there, evenly in time, and its first pose is fresh. At an episode's start the
-    steps before are not needed if the robot stood still. A pose is fresh if its age is the
-    recording's usual one, within a quarter of a control period.
+    The next segment begins `stride_s` later (None: the horizon, so that none overlap), or at the
+    first tick after that at which its first pose is fresh, and all its steps and those of the
+    warm-up (rounded up to whole steps) are there and evenly spaced. At an episode's start, the
+    warm-up is not needed if the robot stood still. A pose is fresh if its age is the recording's
+    median age, within a quarter of a control period.
 
     Raises:
-        ConfigError: a horizon or stride that is not some control periods.
+        ConfigError: the horizon or stride is not a multiple of the control period.
     """
     task, rows = steps.task, steps.now
     horizon = _periods(task, horizon_s, "horizon_s")
@@ -166,9 +166,9 @@ def log_segments(
 
 
 def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
-    """Return which of the first N - horizon ticks have `horizon` evenly spaced ones after them.
+    """Return whether `horizon` evenly spaced ticks follow each tick, (N - horizon,).
 
-    The stamps (N,) are those of one stretch.
+    `stamp_ns` (N,) are the times of one stretch of consecutive steps.
     """
     off = stamp_ns - np.arange(len(stamp_ns)) * period_ns
     windows = np.lib.stride_tricks.sliding_window_view(off, horizon + 1)
@@ -188,10 +188,10 @@ def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
 
 
 def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str, int]]:
-    """Return the segments that ordinary driving explains, and counts of the others by reason."""
+    """Return the segments of ordinary driving, and counts of the others by reason."""
     touched = segments.signals["bumped"].astype(bool).any(axis=1)
     near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
-    # A label is about what the wheels did, also on a floor that is slippery all over.
+    # True conditions are preferred: a label also says slip if the whole floor is slippery.
     known = segments.true_condition != ""
     truth = np.char.find(np.char.add(segments.true_condition, ","), "wheel_slip,") >= 0
     slips = np.where(known, truth, segments.condition == "wheel_slip")
@@ -210,9 +210,9 @@ def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str
 
 
 def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str, int]:
-    """Return the stamp (ns) from which each recording is held out.
+    """Return the time (ns) from which on each recording is held out.
 
-    With four recordings or more, whole ones are held out; else the last part of each.
+    With four or more recordings, whole recordings are held out; else the last part of each.
     """
     names = np.unique(segments.recording_id)
     never, always = np.iinfo(np.int64).max, np.iinfo(np.int64).min
@@ -234,14 +234,14 @@ def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str
 def split_at(
     segments: LoggedSegments, stamps: Mapping[str, int]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which segments (S,) end before their recording's stamp, and which begin after it."""
+    """Return which segments (S,) end before their recording's time, and which begin after it."""
     at = np.array([stamps[str(name)] for name in segments.recording_id], np.int64)
     ticks = segments.signals["stamp_ns"]
     return ticks[:, -1] <= at, ticks[:, 0] >= at
 
 
 def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
-    """Return which rows' poses are about as old as is usual in their recording."""
+    """Return which rows' poses (N,) have about the median age of their recording."""
     age = steps.now["stamp_ns"] - steps.now["pose_stamp_ns"]
     fresh = np.zeros(len(age), np.bool_)
     for recording in np.unique(steps.recording_id):
@@ -251,7 +251,7 @@ def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
 
 
 def whole_periods_s(task: Task, seconds: float) -> float:
-    """Round a length to whole control periods; return it unchanged if that is over 5 % off."""
+    """Round a duration to whole control periods; return it unchanged if that is over 5 % off."""
     period_s = task.control_period_s
     whole = round(max(round(seconds / period_s), 1) * period_s, 6)
     return whole if abs(whole - seconds) <= 0.05 * seconds else seconds
@@ -269,18 +269,18 @@ def _periods(task: Task, seconds: float, name: str) -> int:
 
 
 ROBOTS = 512  # simulated at a time
-SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one
-EMPTY_M = 60.0  # the side of an empty floor; who comes near its wall is put back in its middle
+SLIP_MPS = 0.2  # if the wheels' speed differs by more from the localised one, the latter is used
+EMPTY_M = 60.0  # side of an empty floor; robots near its wall are moved back to the middle
 SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
 
 
 @dataclass(frozen=True)
 class OpenLoopStart:
-    """The initial states of S robots, and the commands that they are given from there.
+    """The initial states of S robots, and their commands from there.
 
     `motion` are the logged wheel speed and yaw rate, gyroscope, localised speed and lateral speed,
-    (S,) each. Without `past` the base controllers begin as if always commanded what their wheels
-    do; with it they begin as those commands leave them.
+    (S,) each. The base controllers begin in the state that the `past` commands lead to or, without
+    `past`, as if they had always been commanded the motion of their wheels.
     """
 
     pose: F64  # (S, 3) x, y and heading
@@ -300,10 +300,10 @@ class OpenLoopResult:
     """The noise-free signals of P twins from S starts: at the start and after each period."""
 
     signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
-    sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
+    sliding_mps: F64  # (P, S, K + 1) sliding speed along the robot, of the wheel that slides faster
     bumped: Bools  # (P, S) in the last period
-    sector_clearance_m: F64  # (P, S, sectors) at the end; none on an empty floor
-    diverged: Bools  # (P, S) the physics broke: the rest says nothing
+    sector_clearance_m: F64  # (P, S, sectors) at the end; (P, S, 0) on an empty floor
+    diverged: Bools  # (P, S) the physics diverged, so the other values are meaningless
 
     @property
     def pose(self) -> F64:
@@ -323,14 +323,13 @@ def drive_open_loop(
 ) -> OpenLoopResult:
     """Drive every start's commands under every perturbation: P x S robots.
 
-    Without a `robot` they are stand-ins.
-
-    The perturbations' own `timestep_s` and sensor noise are not used. The result does not depend
-    on `nthread`, nor on which other starts and perturbations are driven.
+    `robot` None means the twin's stand-in, `warehouse` None an empty floor. The perturbations'
+    `timestep_s` and sensor noise are not used. A drive's result depends neither on `nthread` nor on
+    the other starts and perturbations.
 
     Raises:
-        ConfigError: a timestep that does not divide .1 s, or a control period that the twin
-            cannot keep (no whole number of timesteps).
+        ConfigError: the timestep does not divide .1 s, or the control period is not a whole number
+            of timesteps.
     """
     shape = (len(perturbations), len(start.pose))
     jobs, periods = shape[0] * shape[1], start.command.shape[1]
@@ -377,14 +376,14 @@ def drive_open_loop(
 
 
 def empty_floor() -> Warehouse:
-    """Return a floor without racks."""
+    """Make a floor without racks."""
     middle = (EMPTY_M / 2, EMPTY_M / 2)
     return Warehouse(EMPTY_M, EMPTY_M, racks=(), segments=(), goals_m=(middle,), name="empty")
 
 
 def see_sectors(simulation: Simulation) -> F64:
     """Return the sector clearances (N, sectors) that robots sense now, without noise."""
-    sensing = Sensing(simulation, simulation.task)  # its noise is zero until an episode is drawn
+    sensing = Sensing(simulation, simulation.task)  # has no noise until an episode is drawn
     ids = np.arange(simulation.num_envs)
     return np.asarray(sensing.sense(ids, np.zeros(len(ids), np.int64))["sector_clearance_m"])
 
@@ -396,7 +395,7 @@ def _place(
     *,
     endless: bool,
 ) -> F64:
-    """Put every robot at its logged pose and motion; return map minus simulation (N, 2).
+    """Give every robot its logged pose and motion; return map minus simulated position (N, 2).
 
     On an `endless` floor robots start in its middle.
     """
@@ -429,7 +428,7 @@ def _place(
         controller.begin(np.stack([wheels, turn], axis=-1))
         simulation.steer()
         return offset
-    for step in range(start.past.shape[1]):  # its ramp and its late commands, as they are now
+    for step in range(start.past.shape[1]):  # restores the ramp and the delayed commands
         controller.command(start.past[:, step])
         for block in range(simulation.blocks):
             controller.controls(block * simulation.block_s)
@@ -438,7 +437,7 @@ def _place(
 
 
 def _recentre(simulation: Simulation) -> F64:
-    """Move robots near the wall of an empty floor to its middle; return how far (N, 2)."""
+    """Move robots far from the middle of an empty floor back to it; return by how much (N, 2)."""
     from_middle = simulation.qpos[:, :2] - EMPTY_M / 2
     away = np.where(np.abs(from_middle) > EMPTY_M / 4, from_middle, 0.0)
     simulation.qpos[:, :2] -= away
@@ -446,7 +445,7 @@ def _recentre(simulation: Simulation) -> F64:
 
 
 def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
-    """Return the sliding speed (N,) of the wheels' rims in m/s, the larger of both sides."""
+    """Return the speed (m/s, (N,)) at which rims slide over the floor, the faster of both sides."""
     velocity = simulation.qvel
     forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
     turn = velocity[:, 5] * (simulation.robot.track_m / 2)
@@ -465,15 +464,15 @@ def replay_segments(
 ) -> OpenLoopResult:
     """Drive every segment's commands under every perturbation, on an empty floor.
 
-    The signals are those of poses, laid onto the log so that each first one is the logged one, and
-    of motion, localised speeds too.
+    The result has the K steps without the warm-up, with localised speeds, too. Poses are moved so
+    that each segment begins at its logged pose.
 
     Raises:
         ConfigError: as `drive_open_loop`.
     """
     moving = ~segments.still
     motion = {name: np.where(moving, values, 0.0) for name, values in segments.before.items()}
-    motion["localised_lateral_mps"] = np.zeros(len(segments))  # the warm-up is long enough for it
+    motion["localised_lateral_mps"] = np.zeros(len(segments))  # it settles during the warm-up
     start = OpenLoopStart(np.zeros((len(segments), 3)), motion, segments.command)
     driven = drive_open_loop(
         *(segments.task, start, perturbations),
@@ -492,9 +491,9 @@ def replay_segments(
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
-    """Return speeds (..., K + 1) from poses (..., W + K + 1, 3), computed as in ingest.
+    """Return forward and lateral speeds (..., K + 1) from poses (..., W + K + 1, 3), as in ingest.
 
-    Without a warm-up there is no pose before the first, so its speed is the wheels'.
+    Without a warm-up, no pose precedes the first, so its speed is that of the wheels.
     """
     stamp = np.broadcast_to(np.arange(pose.shape[-2]) * round(period_s * 1e9), pose.shape[:-1])
     columns = {name: pose[..., i] for i, name in enumerate(POSE)} | {"pose_stamp_ns": stamp}

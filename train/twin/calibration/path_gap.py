@@ -1,7 +1,7 @@
-"""The gap between open-loop replays and their log: pose and signals at each horizon's end.
+"""The gap between open-loop replays and their log: poses and signals, for each horizon.
 
-Beside the twins there is `odometry`, the logged wheel odometry dead-reckoned from the same first
-pose: a twin should be better than that.
+For comparison, `odometry` is the logged wheel odometry, integrated from the same first pose. A twin
+should be better than that.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SIGNALS = {
 }
 QUANTITIES = {"position": "m", "heading": "rad", **SIGNALS}
 ODOMETRY = "odometry"
-_AT_ONCE = 4096  # segments replayed at a time: bounds memory
+_AT_ONCE = 4096  # segments that are replayed together; limits memory
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class PathGap:
 
     horizon_s: float
     episode_id: NDArray[np.str_]  # (S,)
-    holds: dict[str, Bools]  # condition -> (S,) counted for it
-    gaps: dict[tuple[str, str], F64]  # (source, quantity) -> (S,); NaN where not known
-    left_out: dict[str, int]
+    holds: dict[str, Bools]  # condition -> (S,) whether a segment counts for it
+    gaps: dict[tuple[str, str], F64]  # (source, quantity) -> (S,); NaN if unknown
+    left_out: dict[str, int]  # reason -> steps
 
 
 def path_gap(
@@ -53,12 +53,13 @@ def path_gap(
     twins: Mapping[str, Perturbation],
     config: GapConfig,
 ) -> PathGap:
-    """Replay segments of `horizon_s`, which overlap by half.
+    """Replay segments of `horizon_s` that overlap by half, and measure their gaps.
 
-    A gap of a pose is at the segment's end, of a signal its root mean square on the way.
+    The gap of a pose is that at the segment's end; that of a signal is the root mean square over
+    the segment.
 
     Raises:
-        ConfigError: a horizon that is not some control periods.
+        ConfigError: the horizon is not a multiple of the control period.
     """
     cut, chosen = overlapping_segments(steps, horizon_s, config)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
@@ -78,13 +79,13 @@ def path_gap(
 def overlapping_segments(
     steps: LoggedSteps, horizon_s: float, config: GapConfig
 ) -> tuple[LoggedSegments, dict[str, Bools]]:
-    """Cut half-overlapping segments of `horizon_s`; also return which (S,) count per condition.
+    """Cut segments of `horizon_s` that overlap by half; return them and a mask (S,) by condition.
 
-    A segment counts for every condition that holds at any of its steps; for `nominal` where none
-    does. At most `max_segments` are drawn of each.
+    A segment counts for every condition that holds at any of its steps, and for `nominal` if none
+    does. At most `max_segments` are drawn per condition.
 
     Raises:
-        ConfigError: a horizon that is not some control periods.
+        ConfigError: the horizon is not a multiple of the control period.
     """
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
@@ -96,7 +97,7 @@ def overlapping_segments(
 def _choose(
     steps: LoggedSteps, cut: LoggedSegments, most: int, rng: np.random.Generator
 ) -> dict[str, Bools]:
-    """Draw at most `most` segments (S,) of each condition."""
+    """Draw at most `most` segments of each condition; return their masks (S,)."""
     rows = cut.row[:, None] + np.arange(cut.horizon_steps)
     chosen = {}
     for name, holds in steps.conditions.items():
@@ -111,7 +112,7 @@ def _choose(
 def _gaps(
     part: LoggedSegments, twins: Mapping[str, Perturbation], config: GapConfig
 ) -> dict[tuple[str, str], F64]:
-    """Return (source, quantity) -> gaps (S,) of these segments."""
+    """Return the gaps (S,) of these segments by source and quantity; NaN if physics diverged."""
     replayed = replay_segments(
         part, list(twins.values()), timestep_s=config.timestep_s, nthread=config.nthread
     )
@@ -126,7 +127,7 @@ def _gaps(
 
 
 def _gap(part: LoggedSegments, pose: F64, signals: Mapping[str, F64]) -> dict[str, F64]:
-    """Return the gaps (S,) of poses (S, K + 1, 3) and signals from those logged."""
+    """Return the gaps (S,) between poses (S, K + 1, 3) and signals and the logged ones."""
     off, fresh = pose[:, -1] - part.pose[:, -1], part.pose_fresh[:, -1]
     gaps = {
         "position": np.where(fresh, np.hypot(off[:, 0], off[:, 1]), np.nan),
@@ -139,7 +140,7 @@ def _gap(part: LoggedSegments, pose: F64, signals: Mapping[str, F64]) -> dict[st
 
 
 def _dead_reckon(part: LoggedSegments) -> F64:
-    """Integrate the wheel odometry from the first logged pose: poses (S, K + 1, 3)."""
+    """Integrate the wheel odometry from the first logged pose; return poses (S, K + 1, 3)."""
     period = part.task.control_period_s
     speed, rate = part.signals["wheel_speed_mps"], part.signals["wheel_yaw_rate_radps"]
     turn = (rate[:, 1:] + rate[:, :-1]) / 2 * period

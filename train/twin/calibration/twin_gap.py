@@ -1,6 +1,6 @@
 """A measured gap: settings, rows, a verdict on each condition, and the folder it is kept in.
 
-The folder is `gap.json`, and the rows as Parquet for any tool that reads it.
+The folder has `gap.json`, and the rows as Parquet files.
 
 A condition is `untrusted` if the twin is shown to be beyond a limit, and `trusted` if it is shown
 to be within, both by the end of a 95 % interval. It is `undecided` if the interval contains the
@@ -30,7 +30,7 @@ UNDECIDED, UNKNOWN = "undecided", "unknown"
 
 FORMAT = "restock-twin-gap/1"
 DOCUMENT = "gap.json"
-FOLDER = "gap"  # where a report looks for it, in a run's directory or a store's
+FOLDER = "gap"  # in the directory of a run or store, for reports and gates
 _F, _I, _S = pa.float64(), pa.int64(), pa.string()
 
 
@@ -60,16 +60,16 @@ class TrustLimits:
     horizon_s: float = 3.0
     position_m: float = 0.2  # nine in ten segments of that horizon end within it
     reward_ratio: float = 1.0  # one-step reward gap over the reward's spread
-    segments: int = 20  # fewer say nothing
+    segments: int = 20  # with fewer segments or episodes the verdict is "unknown"
     episodes: int = 5
 
 
 @dataclass(frozen=True)
 class GapConfig:
-    """Settings of a gap measurement. Raises ConfigError if nothing could be judged by them."""
+    """Settings of a gap measurement. Raises ConfigError if they allow no verdict."""
 
-    horizons_s: tuple[float, ...] = (1.0, 3.0, 6.0)  # among them that of the limits
-    max_segments: int = 400  # a condition and horizon; steps: 5 times that
+    horizons_s: tuple[float, ...] = (1.0, 3.0, 6.0)  # must include that of the limits
+    max_segments: int = 400  # per condition and horizon; 5 times as many steps
     limits: TrustLimits = TrustLimits()
     seed: int = 0
     timestep_s: float = 0.01
@@ -96,7 +96,7 @@ class Verdict:
     reasons: tuple[str, ...]
     segments: int
     episodes: int
-    position_p90: ConfidenceInterval  # m, at the limits' horizon
+    position_p90: ConfidenceInterval  # 90th percentile in m, at the limits' horizon
     reward_ratio: ConfidenceInterval
 
 
@@ -109,7 +109,7 @@ def trust_verdict(
     position_p90: ConfidenceInterval,
     reward_ratio: ConfidenceInterval,
 ) -> Verdict:
-    """Return the verdict on one condition."""
+    """Judge one condition; an unknown reward ratio is ignored."""
     beyond, open_ = [], []
     for interval, limit, reason in (
         (
@@ -152,14 +152,14 @@ def trust_verdict(
 
 @dataclass(frozen=True)
 class TwinGap:
-    """A measured gap. Rows are plain values; statistics carry 95 % intervals over episodes."""
+    """A measured gap. Rows are plain values; statistics have 95 % intervals over episodes."""
 
-    about: dict[str, Any]  # store, version, task, twins, noise, counts
+    about: dict[str, Any]  # store, version, task, twins, limits, floor, counts
     paths: Rows  # condition, horizon_s, quantity, unit, source, segments, episodes, median, p90 …
     observations: Rows  # condition, component, source, steps, mean_gap, low, high
     rewards: Rows  # condition, term, source, steps, mean_gap, low, high, bias, spread
     verdicts: tuple[Verdict, ...]
-    not_done: tuple[str, ...]
+    not_done: tuple[str, ...]  # comparisons that were not possible, in sentences
 
     @property
     def untrusted(self) -> list[str]:
@@ -178,7 +178,7 @@ class TwinGap:
 
 
 def check_place(folder: Path) -> None:
-    """Raise RunError if `folder` holds anything but an earlier gap."""
+    """Raise RunError if `folder` has anything but an earlier gap."""
     if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
         if folder.is_dir() and not any(folder.iterdir()):
             return
@@ -189,7 +189,7 @@ def write_gap(gap: TwinGap, folder: Path | str) -> None:
     """Write a gap, replacing an earlier one.
 
     Raises:
-        RunError: there is something else at `folder`.
+        RunError: `folder` has something else.
     """
     folder = Path(folder)
     check_place(folder)
@@ -206,12 +206,12 @@ def write_gap(gap: TwinGap, folder: Path | str) -> None:
 
 
 def gap_folder(places: Iterable[Path]) -> Path | None:
-    """Return the folder of the first of these runs and stores for which a gap was measured."""
+    """Return the gap's folder of the first of these runs and stores that has one; else None."""
     return next((place / FOLDER for place in places if (place / FOLDER / DOCUMENT).is_file()), None)
 
 
 def read_gap(folder: Path) -> TwinGap:
-    """Read what `write_gap` wrote.
+    """Read a gap that `write_gap` wrote.
 
     Raises:
         RunError: there is no gap in `folder`, or it cannot be read.

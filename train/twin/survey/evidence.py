@@ -1,10 +1,10 @@
-"""The evidence for a floor in a recording or store: a map, poses, scans, its robot.
+"""The evidence for a floor in a recording or store: a map, poses, scans, the robot's size.
 
-The map is a recording's last `nav_msgs/OccupancyGrid` that is no costmap. Map servers write 0, 100
-or -1; some SLAM (Cartographer) writes how likely each cell is occupied. Below 25 percent counts as
-free and above 65 as occupied, as when `map_saver` writes a `map.yaml`.
+The map is a recording's last `nav_msgs/OccupancyGrid` that is not a costmap. Map servers write 0,
+100 or -1. Some SLAM packages (Cartographer) write the probability that a cell is occupied. Below 25
+percent a cell counts as free, and above 65 as occupied, as when `map_saver` writes a `map.yaml`.
 
-A store keeps no maps, and of scans only the clearance in a few sectors: both are read from the
+A store keeps no maps, and only the clearance of scans in a few sectors. So both are read from the
 recording that the rows came from, if it still exists.
 """
 
@@ -48,7 +48,7 @@ from restock.train.twin.survey.poses import (
 
 TYPE = "nav_msgs/msg/OccupancyGrid"
 FREE_BELOW, OCCUPIED_ABOVE = 25, 65  # percent
-_OTHERS = ("costmap", "cost_map", "transformed", "local", "_updates")  # in the topic's name
+_OTHERS = ("costmap", "cost_map", "transformed", "local", "_updates")  # in names of other grids
 _INFO = (
     "info.resolution",
     "info.width",
@@ -62,7 +62,7 @@ _FRAME = "header.frame_id"
 
 
 def map_topic(recording: Recording) -> TopicInfo | None:
-    """Return the topic of the recording's map: `/map` before any other."""
+    """Return the topic of the recording's map, preferably `/map`; None if it has none."""
     found = [
         topic
         for topic in recording.topics.values()
@@ -73,10 +73,10 @@ def map_topic(recording: Recording) -> TopicInfo | None:
 
 
 def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
-    """Return a recording's last map and where it is from, in words; None if it has none.
+    """Return a recording's last map and a text on its source; None if it has no map.
 
     Raises:
-        RecordingError: the message is not a map: its size, resolution or origin are not.
+        RecordingError: the map's size, resolution or origin is not valid.
     """
     topic = map_topic(recording)
     if topic is None:
@@ -117,26 +117,24 @@ _POSES = (
 
 @dataclass(frozen=True)
 class StoredDrive:
-    """A drive of one recording of a store, and whose poses they are."""
+    """The drive of one recording of a store, and those of the others with the same profile."""
 
     poses: Poses
-    everywhere: (
-        Poses  # of all recordings by the same profile: places of one map, where there is one
-    )
-    recording: Path | None  # where it lies; None where it is no longer there
-    profile: Profile | None  # that its rows were made by
-    others: Mapping[str, Drive]  # of the largest other recordings by that profile, by source
+    everywhere: Poses  # of all recordings with this profile; in one frame if they share a map
+    recording: Path | None  # its file; None if that no longer exists
+    profile: Profile | None  # that its rows were ingested with; None if unreadable
+    others: Mapping[str, Drive]  # source -> drive, of the largest other recordings
     notes: list[str] = field(default_factory=list)
 
 
 def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
-    """Return the recording with the most rows, preferring those whose files still exist.
+    """Return the drive of the recording with the most rows, preferably one whose file still exists.
 
     Args:
-        recording: which one instead: its id, or its file's name or the end of its path.
+        recording: chooses another one: its ID, its file's name or the end of its path.
 
     Raises:
-        StoreError: the store is empty, cannot be read, or has no such recording or several.
+        StoreError: the store is empty or cannot be read, or `recording` fits none or several.
     """
     sql = (files("restock.train.twin.survey") / "stored_drive.sql").read_text(encoding="utf-8")
     with Store(str(path)) as store:
@@ -161,15 +159,15 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
     if file is None:
         notes.append(f"{source} no longer exists: its map and its scans cannot be read")
     if len(rows) > 1:
-        notes.append(f"by {source}, of {len(rows)} recordings in the store")
+        notes.append(f"made from {source}, one of {len(rows)} recordings in the store")
     return StoredDrive(poses, everywhere, file, profile, others, notes)
 
 
 def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
-    """Return the only row of the recordings that this names.
+    """Return the row whose ID, file name or end of path is `recording`.
 
     Raises:
-        StoreError: none, or several.
+        StoreError: no row fits, or several do.
     """
     end = Path(recording).parts
     found = [
@@ -198,7 +196,7 @@ def _poses(store: Store, recordings: list[str], source: str) -> Poses:
 def _stored_profile(toml: str | None, source: str) -> Profile | None:
     try:
         return parse_profile(toml, where=f"the profile of {source}") if toml else None
-    except RestockError:  # of another version: what it said of topics is guessed again
+    except RestockError:  # written by another version: topics are guessed instead
         return None
 
 
@@ -207,9 +205,9 @@ class Evidence:
     """The data that a floor can be made from; None for what is missing."""
 
     poses: Poses | None
-    known: tuple[OccupancyGrid, str] | None  # a map, and where it is from
+    known: tuple[OccupancyGrid, str] | None  # a map, and a text on its source
     footprint: Footprint | None = None
-    scans: list[PlacedScans] = field(default_factory=list)  # by one clock, and by another
+    scans: list[PlacedScans] = field(default_factory=list)  # once per clock
     notes: list[str] = field(default_factory=list)
     others: Mapping[str, Drive] = field(default_factory=dict)  # of a store's other recordings
 
@@ -224,14 +222,13 @@ def gather(
     profile: Profile | None,
     definitions: str | None,
 ) -> Evidence:
-    """Read what a floor can be made from, out of a recording or one recording of a store.
+    """Read the data for a floor from a recording, or from one recording of a store.
 
-    Of a store, it is `stored_recording`, or the one with the most rows.
-
-    With `with_map`, an invalid map is an error; without it, such a map is ignored.
+    In a store, this is `stored_recording` or, if that is None, the one with the most rows. If
+    `with_map` is False, an invalid map is ignored and not an error.
 
     Raises:
-        RecordingError: it cannot be read, or its map is invalid.
+        RecordingError: the recording cannot be read, or its map is invalid.
         ConfigError: `map_yaml` is invalid.
         StoreError: the store is empty, or cannot be read.
     """
@@ -250,7 +247,7 @@ def gather(
         free_on = _free_on(known)
         poses = own = choose_poses(candidate_poses(recording, profile), free_on)
         if with_map and known and stored is not None and _lies_on(stored.everywhere, free_on):
-            poses = stored.everywhere  # drives on one map are in one frame
+            poses = stored.everywhere  # all recordings lie on this map, so they share its frame
         size = _of_profile(profile) or footprint_of(descriptions(recording))[0]
         scans: list[PlacedScans] = []
         if with_scans and own is not None:
@@ -284,7 +281,7 @@ def _of_profile(profile: Profile | None) -> Footprint | None:
 
 
 def _free_on(known: tuple[OccupancyGrid, str] | None) -> Callable[[F64], Bools]:
-    """Return a test whether places (N, 2) are free on a map; without a map, all are."""
+    """Return a function that tests whether places (N, 2) are free on the map; all without one."""
 
     def on_map(places_m: F64) -> Bools:
         if known is None:

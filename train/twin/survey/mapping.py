@@ -1,21 +1,21 @@
 """Occupancy grids made from scans, or from the corridor that a robot drove in.
 
-Scans are traced ray by ray: each makes the cells that its beams pass less likely occupied, and
-those they end in more (log-odds, Elfes 1989); a cell counts once a scan. Poses are taken as they
-are: nothing is matched, and loops are not closed. How well scans agree is the share of beams that
-end within one cell of a wall of the map that all of them made.
+Each scan makes the cells that its beams pass less likely to be occupied, and those in which they
+end more likely (log-odds, Elfes 1989). A scan changes a cell only once. Poses are used as they are,
+without scan matching or loop closure. The agreement of scans is the share of beams that end within
+one cell of a wall of the map made from all of them.
 
-Without a lidar all that is known is that the robot fitted where it was: its outline and a margin
-around its way are free, and everything beyond counts as a wall.
+Without a lidar it is only known that the robot fitted where it was. So its outline and a margin
+around its path are free, and everything beyond counts as a wall.
 
-Floors and boxes are straight along their axes, maps need not be, so grids are turned along their
-walls. Directions that differ by a right angle count as one: of angles a_i with weights w_i, the
-main one is the argument of the sum of w_i exp(4 i a_i), divided by four.
+The boxes of a floor are parallel to its axes, but a map's walls may not be, so grids are turned.
+Directions that differ by a right angle count as one: with angles a_i and weights w_i, the main
+direction is the argument of the sum of w_i exp(4 i a_i), divided by four.
 
-Scans are placed where the robot was when they were taken. Left out, and counted: scans without a
-pose within a second on both sides, those taken while the robot turned fast (a scan takes up to .2
-s, and the pose is known less well), and most of those taken where it stood. Beams without a return
-say nothing, whether they are inf, NaN or 0.
+Scans are placed at the robot's pose at their time. These are left out and counted: scans without a
+pose within a second before and after, and scans taken while turning fast, as a scan takes up to
+.2 s, and poses are less exact then. Most scans of a robot that stands are left out, too. Beams
+without a return (inf, NaN or 0) are ignored.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ from restock.train.twin.floors.occupancy_grid import (
 from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M, RETURNS, WITHIN_M
 from restock.train.twin.survey.poses import JUMP_M, Poses, Times, shared_clock
 
-BEAMS = 360  # at most, of a scan: more are thinned out
-SCANS = 3000  # at most, of a recording
-MOVED_M, TURNED_RAD, WAITED_S = 0.05, 0.05, 2.0  # since the scan before: else it is left out
-FAST_RADPS = 0.6  # turning
-_LIMITS = ("range_min", "range_max")  # where scans have them
+BEAMS = 360  # scans with twice as many beams or more are thinned to about this number
+SCANS = 3000  # most scans of a recording that are used
+MOVED_M, TURNED_RAD, WAITED_S = 0.05, 0.05, 2.0  # a scan is used if one of these has passed
+FAST_RADPS = 0.6  # scans during faster turns are left out
+_LIMITS = ("range_min", "range_max")  # fields that a type of scan may have
 
 
 @dataclass(frozen=True)
 class PlacedScans:
-    """Scans in the frame of the poses: from `origin_m`, beam by beam, to `hit_m`."""
+    """N scans in the frame of the poses: beams from `origin_m` to `hit_m`."""
 
-    origin_m: F64  # (N, 2) of the lidar
-    hit_m: list[F64]  # N of (B, 2)
-    order: list[Ints]  # N of (B,): which beam of its scan each is
+    origin_m: F64  # (N, 2) positions of the lidar
+    hit_m: list[F64]  # N arrays (B, 2) of the ends of beams
+    order: list[Ints]  # N arrays (B,) of the beams' indices in their scan
     source: str
     notes: list[str] = field(default_factory=list)
 
@@ -75,8 +75,8 @@ def placed_scans(
 ) -> list[PlacedScans]:
     """Place a recording's lidar scans on the map, once per clock shared with the poses.
 
-    Header stamps come first, then log time, since the clocks of two computers may differ. Empty if
-    there are no scans, or none that can be placed.
+    Header stamps come first, then log time, as the clocks of two computers may differ. The result
+    is empty if there are no scans, or none can be placed.
     """
     fit = _topic(recording, profile)
     if fit is None:
@@ -95,7 +95,7 @@ def placed_scans(
     frame = scans_of(recording, [fit])[topic].frame
     turn, place = _mount(recording, frame, profile, footprint, notes)
     first, last = (np.asarray(columns.fields[path], np.float64) for path in angles)
-    if "angle_max_rad" in kind.fields:  # of so many beams
+    if "angle_max_rad" in kind.fields:  # the type has no angle increment
         last = (last - first) / np.maximum(np.asarray(columns.fields["count"]) - 1, 1)
     times = Times.of(columns)
     clocks = [True, False] if shared_clock(poses.times, times) else [False]
@@ -116,9 +116,10 @@ def _placed(
     *,
     by_stamp: bool,
 ) -> PlacedScans:
-    """Place the scans of a topic at the poses of one clock.
+    """Place the scans of a topic, with poses looked up by one clock.
 
-    `bearings` (N,) are those of each scan's first beam, and the steps from beam to beam.
+    `mount` is the lidar's rotation and position; `bearings` are each scan's first bearing (N,) and
+    its step from beam to beam (N,).
     """
     times, (turn, place), notes = Times.of(columns), mount, list(notes)
     pose, known = poses.at(times, by_stamp=by_stamp)
@@ -151,7 +152,7 @@ def _placed(
 
 
 def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Kind] | None:
-    """Return the topic of the lidar's scans, and their fields."""
+    """Return the topic of the lidar's scans, and its type and fields; None if there is none."""
     if profile is not None:
         scan = profile.inputs.scan
         named = None if scan is None else recording.topics.get(scan.topic)
@@ -163,7 +164,7 @@ def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Ki
 
 
 def _thinned(path: str, fields: Fields) -> dict[str, FieldColumn]:
-    """Keep at most BEAMS beams per scan; return ranges, beam indices and beam counts."""
+    """Thin scans to fewer than 2 BEAMS beams; return ranges, beam indices and beam counts."""
     ranges = fields[path]
     rows = [np.asarray(ranges[row], np.float32).ravel() for row in range(len(ranges))]
     kept = [np.arange(0, len(row), max(len(row) // BEAMS, 1)) for row in rows]
@@ -186,7 +187,7 @@ def _mount(
     footprint: Footprint | None,
     notes: list[str],
 ) -> tuple[F64, F64]:
-    """Return the lidar's rotation (3, 3) and place (3,) on the robot."""
+    """Return the lidar's rotation (3, 3) and position (3,) on the robot."""
     over = np.diag([1.0, -1.0, -1.0])
     scan = None if profile is None else profile.inputs.scan
     bases = [profile.frames.base] if profile is not None and profile.frames is not None else []
@@ -197,7 +198,7 @@ def _mount(
             if scan is None or scan.upside_down == (turn[2, 2] < 0):
                 return turn, place
             way = "upside down" if scan.upside_down else "upright"
-            notes.append(f"the lidar is {way} by inputs.scan of the profile, and not by {frame}")
+            notes.append(f"the lidar is {way} by the profile's inputs.scan, but not by {frame}")
             return turn @ over, place
     ahead: float | None = None
     yaw: float | None = None
@@ -210,7 +211,7 @@ def _mount(
         (ahead, left), yaw = scan.lidar_at_m, scan.lidar_yaw_rad or 0.0
     if ahead is None or yaw is None:
         notes.append(
-            "the position of the lidar is not known: it is assumed to be in the robot's middle, "
+            "the position of the lidar is unknown: it is assumed to be in the robot's middle, "
             "facing ahead"
         )
     turn = _turn(yaw or 0.0)
@@ -225,7 +226,7 @@ def _turn(yaw_rad: float) -> F64:
 
 
 def _keyframes(pose: F64, known: Bools, log_ns: Ints, topic: str, notes: list[str]) -> Ints:
-    """Choose the scans to use: placed, not while turning fast, and where it moved or waited."""
+    """Choose the scans to use: with a pose, not in fast turns, and after a move or some time."""
     rows = np.flatnonzero(known)
     if len(rows) < len(known):
         notes.append(
@@ -257,9 +258,9 @@ def _keyframes(pose: F64, known: Bools, log_ns: Ints, topic: str, notes: list[st
     return np.array(kept, np.int64)
 
 
-AGREEING = 0.25  # of the weight, less than this says nothing
+AGREEING = 0.25  # least share of the weight that must agree on a direction
 MIN_TURN_RAD = np.deg2rad(3.0)
-_SUB = 3  # points a cell and axis that a turned cell is looked up at
+_SUB = 3  # points per axis at which a turned cell is sampled
 
 
 def main_direction(angles_rad: F64, weights: F64) -> float:
@@ -272,7 +273,7 @@ def main_direction(angles_rad: F64, weights: F64) -> float:
 
 
 def walls_direction(grid: OccupancyGrid) -> float:
-    """Return the direction of a grid's walls against its axes."""
+    """Return the angle (rad) between a grid's walls and its axes."""
     walls = ndimage.gaussian_filter((grid.occupancy == OCCUPIED).astype(np.float32), 1.5)
     across_x, across_y = np.gradient(walls)
     return main_direction(np.arctan2(across_y, across_x), np.hypot(across_x, across_y))
@@ -281,7 +282,7 @@ def walls_direction(grid: OccupancyGrid) -> float:
 def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
     """Return the grid with its axes along its walls, and the angle it was turned by (rad).
 
-    A turned cell is occupied where any part of it was, so that no wall gets a hole.
+    A new cell is occupied if any part of it was, so that walls get no holes.
     """
     known = grid.occupancy != UNKNOWN
     if not known.any():
@@ -324,9 +325,9 @@ MARGIN_M = 0.25  # around the circle in which the robot turns
 
 
 def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
-    """Return the driven corridor as a grid along the directions that were mostly driven.
+    """Return the driven corridor as a grid, with its axes along the main driving directions.
 
-    `turn_m` is what the robot needs around its middle to turn.
+    `turn_m` is the radius that the robot needs to turn.
     """
     step = np.diff(poses.places_m, axis=0)
     length = np.hypot(*step.T)
@@ -348,7 +349,10 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
 
 
 def way_between(places_m: F64) -> F64:
-    """Return places (N, 2) with points less than a cell apart between those driven in turn."""
+    """Return places (N, 2) and, appended, points less than a cell apart between successive ones.
+
+    Jumps are not filled.
+    """
     parts = [places_m]
     length = np.hypot(*np.diff(places_m, axis=0).T)
     for index in np.flatnonzero((length > CORRIDOR_CELL_M / 2) & (length <= JUMP_M)):
@@ -362,8 +366,8 @@ def way_between(places_m: F64) -> F64:
 def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
     """Return the share of lidar returns within NEAR_M of an occupied cell of a map.
 
-    Returns farther than `WITHIN_M` from the lidar do not count: an error of the pose's yaw moves
-    them. None where there are too few to say.
+    Returns farther than `WITHIN_M` from the lidar are ignored, as they move with errors of the
+    yaw. None if there are too few returns, or no walls.
     """
     nearby = [
         hit[np.hypot(*(hit - origin).T) < WITHIN_M]
@@ -384,21 +388,21 @@ def _wall_middles(grid: OccupancyGrid) -> F64:
 
 
 CELL_M = 0.05
-REACH_M = 8.0  # of a beam: what is further is less well known than a cell
-HIT, MISS = 0.9, -0.5  # log-odds
-MOST = 4.0  # of the log-odds either way
+REACH_M = 8.0  # beams are cut there, as farther points are less exact than a cell
+HIT, MISS = 0.9, -0.5  # changes of log-odds
+MOST = 4.0  # largest absolute log-odds
 FREE_BELOW, OCCUPIED_ABOVE = -0.9, 0.6
-_APART = 4  # beams, of two whose ends show which way a wall runs: neighbours' are mostly noise
-_WALL_STEP_M = 0.6  # between their ends, on one wall
+_APART = 4  # beams between two ends that give a wall's direction; closer ends are mostly noise
+_WALL_STEP_M = 0.6  # longest distance between two such ends on one wall
 
 
 def scan_map(
     scans: PlacedScans, driven_m: F64, room_m: float, frame: str, notes: list[str]
 ) -> tuple[OccupancyGrid, float]:
-    """Build the map that scans show, its axes along the walls; also return how well they agree.
+    """Build a map from scans, with its axes along the walls; also return the scans' agreement.
 
-    Floor within `room_m` of the robot's places `driven_m` (N, 2) is free. The agreement is the
-    share of beams that end on a wall.
+    Floor within `room_m` of the robot's path `driven_m` (N, 2) is free. The agreement is the share
+    of beams that end within one cell of a wall.
     """
     yaw = main_direction(*_walls(scans))
     turned = (0.0, 0.0, yaw)
@@ -426,7 +430,7 @@ def scan_map(
 
 
 def _walls(scans: PlacedScans) -> tuple[F64, F64]:
-    """Return the directions and lengths of the wall pieces between the ends of beams."""
+    """Return the directions (rad) and lengths (m) of pieces of wall between the ends of beams."""
     steps = []
     for hit, beam in zip(scans.hit_m, scans.order, strict=True):
         if len(hit) > _APART:
@@ -439,7 +443,7 @@ def _walls(scans: PlacedScans) -> tuple[F64, F64]:
 
 
 def _cut(origin: F64, hit: F64) -> tuple[F64, F64, Bools]:
-    """Cut beams (B, 2) at REACH_M; return their ends, lengths (B,) and which are hits (B,)."""
+    """Cut beams at REACH_M; return their ends (B, 2), lengths (B,), and which were not cut (B,)."""
     along = hit - origin
     length = np.hypot(*along.T)
     share = np.minimum(1.0, REACH_M / np.maximum(length, 1e-9))
@@ -451,7 +455,7 @@ def _cells(places: F64, low: F64) -> Ints:
 
 
 def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> tuple[F64, Ints]:
-    """Return log-odds (X, Y) of being occupied, and how many scans ended in each cell."""
+    """Return the log-odds (X, Y) that cells are occupied, and how many scans ended in each cell."""
     odds = np.zeros(shape)
     flat, ended = odds.reshape(-1), np.zeros(odds.size, np.int64)
     passed, stopped = np.zeros((2, odds.size), np.bool_)  # of one scan
@@ -475,7 +479,7 @@ def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> 
 
 
 def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
-    """Free single wall cells within free floor, such as a person's legs; return which (X, Y)."""
+    """Free single wall cells in free floor, such as a person's legs; return their mask (X, Y)."""
     neighbours = ndimage.convolve(walls.astype(np.int8), np.ones((3, 3), np.int8), mode="constant")
     alone = walls & (neighbours == 1)
     surrounded = ndimage.convolve(
@@ -484,5 +488,5 @@ def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
     alone &= surrounded >= 7
     if alone.any():
         occupancy[alone] = FREE
-        notes.append(f"{int(alone.sum()):,} single cells of wall on free floor: left out")
+        notes.append(f"{int(alone.sum()):,} single wall cells on free floor: left out")
     return np.asarray(alone, np.bool_)

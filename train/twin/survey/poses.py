@@ -1,8 +1,8 @@
-"""The poses of a robot in a recording, from a pose topic or along its transforms.
+"""The poses of a robot in a recording, from a pose topic or from transforms.
 
-Unlike steps, which know nothing of the future, a survey looks at a whole drive: poses are
-interpolated between messages. Times are kept on both clocks of a recording, as a scan is placed on
-the one that both its topic and the pose's carry.
+Unlike steps, which must not see the future, a survey uses the whole drive, so poses are
+interpolated between messages. Times are kept on both clocks of a recording (header stamps and log
+time), as scans and poses are matched by a clock that both topics have.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.input_columns import fixes_of
 from restock.ingest.task.task import yaw_of
 
-MAX_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
-JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
-WELL_PLACED = 0.9  # of the poses on free floor
-FURTHEST_M = 1e5  # from the middle of the poses: one beyond is a fault
+MAX_APART_NS = 1_000_000_000  # longest time from an interpolated pose to the nearest on each side
+JUMP_M = 1.0  # over longer distances between two poses the robot was carried or relocalised
+WELL_PLACED = 0.9  # share of the poses on free floor
+FURTHEST_M = 1e5  # from the median pose; poses beyond are faulty
 
 
 @dataclass(frozen=True)
 class Times:
-    """The times of N messages in ns, measured and received; measured is 0 if unknown."""
+    """The times of N messages in ns on two clocks."""
 
-    stamp_ns: Ints  # (N,)
-    log_ns: Ints  # (N,)
+    stamp_ns: Ints  # (N,) header stamps; 0 if unknown
+    log_ns: Ints  # (N,) log times
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Times:
@@ -59,7 +59,7 @@ class Times:
 
 
 def shared_clock(one: Times, other: Times) -> bool:
-    """Return whether both carry stamps of one clock: most of `other`'s are within `one`'s."""
+    """Return whether both have stamps of one clock: most of `other`'s lie in the span of `one`."""
     if not (one.stamped and other.stamped):
         return False
     low, high = one.stamp_ns.min() - MAX_APART_NS, one.stamp_ns.max() + MAX_APART_NS
@@ -68,26 +68,26 @@ def shared_clock(one: Times, other: Times) -> bool:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses (N,) of a robot's base in a frame, in the order of their log time."""
+    """N poses of a robot's base in a frame, in the order of their log time."""
 
     times: Times
     x_m: F64
     y_m: F64
-    yaw_rad: F64  # unwrapped; NaN where nothing says
+    yaw_rad: F64  # unwrapped; NaN if unknown
     frame: str
-    source: str  # in words
+    source: str  # for people
 
     def __len__(self) -> int:
         return len(self.x_m)
 
     @property
     def places_m(self) -> F64:
-        """Return the places, (N, 2)."""
+        """Return the positions, (N, 2)."""
         return np.stack([self.x_m, self.y_m], axis=-1)
 
     @property
     def driven_m(self) -> float:
-        """Return the length of its way in steps of a decimetre, jumps left out."""
+        """Return the length of the path, in steps of at least a decimetre and without jumps."""
         kept, way = self.places_m[:1], 0.0
         for place in self.places_m[1:]:
             step = float(np.hypot(*(place - kept[-1])))
@@ -96,7 +96,7 @@ class Poses:
         return way
 
     def at(self, times: Times, *, by_stamp: bool) -> tuple[F64, Bools]:
-        """Return poses (M, 3) at these times, and which of them (M,) are between two near ones."""
+        """Return poses (M, 3) at these times, and which (M,) are known, as in `interpolated`."""
         values = np.stack([self.x_m, self.y_m, self.yaw_rad], axis=-1)
         return interpolated(
             self.times.clock(by_stamp=by_stamp), values, times.clock(by_stamp=by_stamp)
@@ -104,7 +104,10 @@ class Poses:
 
 
 def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bools]:
-    """Interpolate values (N, K) at times (M,); also return which are between near samples."""
+    """Interpolate values (N, K) at times (M,); also return which have a near sample on each side.
+
+    Near means within `MAX_APART_NS`.
+    """
     if not len(known_ns):
         return np.zeros((len(asked_ns), values.shape[1])), np.zeros(len(asked_ns), np.bool_)
     order = np.argsort(known_ns, kind="stable")
@@ -123,10 +126,10 @@ def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bool
 
 
 def candidate_poses(recording: Recording, profile: Profile | None = None) -> list[Poses]:
-    """Return the pose sources of a recording, best first; empty if there are none.
+    """Return the poses of each pose source of a recording, best source first; empty without any.
 
-    With a profile, only its pose counts. Without, the order is: transforms that lead to a map, pose
-    topics (localised ones first), and other transforms.
+    With a profile, only its source of poses is used. Otherwise the order is: transforms from a map,
+    pose topics (localised ones first), other transforms. Satellite fixes are the last resort.
     """
     if profile is not None:
         at, (x_m, y_m) = _by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
@@ -138,16 +141,16 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     kinds = topics_for(recording, KINDS["pose"])
     fixes = {topic.name: kind.fields for topic, kind in kinds if kind.by_fix}
     found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
-    if not found and along is None:  # another frame than anything else's, and no heading
+    if not found and along is None:  # fixes have a frame of their own, and no heading
         found = [p for name, of in fixes.items() for p in [_by_fixes(recording, name, of)] if p]
     return [p for p in ((along, *found) if on_map(guess) else (*found, along)) if p is not None]
 
 
 def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) -> Poses | None:
-    """Return the first poses that move far enough and are on free floor, else those most on it.
+    """Return the first candidate that moves and is on free floor, else the one most on free floor.
 
-    `on_map` says which places (N, 2) are free. A localiser that never ran leaves poses that stand
-    still, or lie in walls.
+    `on_map` returns which places (N, 2) are free. If a localiser never ran, its poses stand still
+    or lie in walls.
     """
     furthest = max((poses.driven_m for poses in candidates), default=0.0)
     moving = [p for p in candidates if len(p) > 1 and p.driven_m >= furthest / 2]
@@ -172,7 +175,7 @@ def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
 
 
 def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) -> list[Poses]:
-    """Read the poses in these fields of topics; topics without such fields are left out."""
+    """Read poses from topics with these fields; topics that lack a field are left out."""
     wanted: dict[str, list[str]] = {}
     for topic, fields in topics.items():
         leaves = set(recording.leaves(topic))
@@ -234,9 +237,9 @@ def _poses(times: Times, x: F64, y: F64, yaw: F64, frame: str, source: str) -> P
 
 
 def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
-    """Compute the poses of `frames.base` in `frames.fixed`; None if no transforms join them.
+    """Compute the poses of `frames.base` in `frames.fixed`; None if no transforms connect them.
 
-    The poses are at the times of the moving transform that is sent most often.
+    The poses have the times of the moving transform that is sent most often.
     """
     edges = transform_edges(recording, frames)
     chain = chain_between(edges, frames.base, frames.fixed)
@@ -246,7 +249,7 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
     clock = Times.of(edges.topics[max(moving)[1] if moving else chain[0]])
     x, y, yaw = (np.zeros(len(clock.log_ns)) for _ in range(3))
     sane = np.ones(len(x), np.bool_)
-    for name in chain:  # from the base up
+    for name in chain:  # from the base to the fixed frame
         columns = edges.topics[name]
         step = np.stack(_planar(columns), axis=-1)
         if name in edges.static or len(columns) == 1:
@@ -267,7 +270,7 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
 
 
 def _planar(columns: TopicColumns) -> tuple[F64, F64, F64]:
-    """Return x, y and unwrapped yaw of transforms (N,)."""
+    """Return x, y and the unwrapped yaw of N transforms, (N,) each."""
     x, y = (np.asarray(columns.fields[axis], np.float64) for axis in AXES[:2])
     yaw = yaw_of(*(np.asarray(columns.fields[part], np.float64) for part in TURN))
     return x, y, np.unwrap(yaw)

@@ -1,4 +1,4 @@
--- The recordings of a store, the one with the most rows first.
+-- The recordings of a store that have rows, those with the most rows first.
 SELECT recording_id, source_file, profile_toml, rows_
 FROM recordings
 JOIN (SELECT recording_id, count(*) AS rows_ FROM transitions GROUP BY recording_id)

@@ -3,8 +3,8 @@
     surveyed = survey(Path("logs/run.mcap"))
     surveyed.floor, surveyed.source, surveyed.notes
 
-Its zones (aisles and crossings, or quarters if it has none) are the same as `[[zone]]` of a
-profile: logs of the same map and episodes in the twin then name the same places.
+The floor's zones (aisles and crossings, or quarters if it has no aisles) can be written as the
+`[[zone]]` of a profile, so that logs from this map and episodes in the twin name the same places.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from restock.train.twin.survey.mapping import (
 from restock.train.twin.survey.poses import Poses
 
 Source = Literal["map", "scans", "corridor"]
-MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
+MARGIN_M = 0.05  # beyond half the body's width, when it drives along a wall
 TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
 STAND_IN = Footprint(0.7, 0.5, "the twin's default robot: the size of this robot is not known")
 MIN_BODY_M = 0.15
 MIN_SCANS = 8
-AGREEING, WELL_AGREEING = 0.5, 0.8  # of the ends of scans, on walls that they made together
-CLOCKS_APART = 0.1  # more of them by another clock: that one is right
-MAX_OFF = 0.5  # of the poses: a map that fewer lie on is not theirs
+AGREEING, WELL_AGREEING = 0.5, 0.8  # shares of the scans' ends on walls of the combined map
+CLOCKS_APART = 0.1  # another clock is used if this share more agrees with it
+MAX_OFF = 0.5  # largest share of the poses off free floor, for a map to be theirs
 
-# Of a lidar's returns: on the walls of a map that fewer lie on, the poses are not in its frame.
-# Measured on other people's robots with their own maps: .58 (badly localised) to 1.0.
+# Least share of lidar returns on a map's walls; with less, the poses are not in the map's frame.
+# Other people's robots with their own maps have .58 (badly localised) to 1.0.
 MIN_ON_WALLS = 0.5
 
 
@@ -60,13 +60,13 @@ class Surveyed:
     """A surveyed floor, its source, and notes for the user."""
 
     floor: Warehouse
-    grid: OccupancyGrid  # as the floor was made of it
+    grid: OccupancyGrid  # that the floor was made from
     by: Source
-    source: str  # in words
+    source: str  # for people
     footprint: Footprint
     poses: Poses | None = None
     notes: list[str] = field(default_factory=list)
-    elsewhere: list[str] = field(default_factory=list)  # a store's recordings of other frames
+    elsewhere: list[str] = field(default_factory=list)  # recordings of the store in other frames
 
     def facts(self) -> dict[str, Any]:
         """Return the survey as plain values, for people and JSON."""
@@ -106,17 +106,17 @@ def survey(
 
     Args:
         path: of the recording or store.
-        recording: of a store, by its id or the end of its path; None: the one with the most rows.
-        map_yaml: the map that its robot localised in, in place of one in the recording.
+        recording: of a store, its ID or the end of its path; None: the one with the most rows.
+        map_yaml: the map that the robot localised in; replaces one in the recording.
         by: what to make the floor from; None: the first of map, scans and corridor that is there.
-        profile: says which topics are the pose and the scan, and how large the robot is; of a
-            store, the one that it was ingested by if this is None.
-        footprint: how large the robot is, before anything else that says it.
-        definitions: as `open_recording` takes it.
+        profile: defines the topics of pose and scan, and the robot's size; None: for a store, the
+            profile that it was ingested with, else guesses.
+        footprint: the robot's size; takes precedence over all other sources.
+        definitions: as in `open_recording`.
 
     Raises:
-        RecordingError: it cannot be read, or holds nothing that a floor can be made from.
-        ConfigError: the map is none, or not of these poses; or no floor for this robot.
+        RecordingError: it cannot be read, or has nothing that a floor can be made from.
+        ConfigError: the map is invalid or does not fit the poses, or the robot has no room.
         StoreError: the store is empty, cannot be read, or has no such recording.
     """
     if recording is not None and not is_store(path):
@@ -124,7 +124,7 @@ def survey(
             "a recording can only be chosen from a store, and this is not one", where=str(path),
             remedy="leave it out, or give the store",
         )  # fmt: skip
-    choose_definitions(definitions)  # once, not for each recording of a folder
+    choose_definitions(definitions)  # checks them before anything is read
     evidence = gather(
         path,
         stored_recording=recording,
@@ -160,7 +160,7 @@ def survey(
 def _grid(
     evidence: Evidence, by: Source | None, body: Footprint | None, where: str, notes: list[str]
 ) -> tuple[Source, OccupancyGrid, str]:
-    """Return how the floor is made, the grid, and where that is from in words."""
+    """Return the kind of source of the floor, its grid, and a text on the source."""
     poses = evidence.poses
     if by in (None, "map") and evidence.known is not None:
         grid, source = evidence.known
@@ -177,7 +177,7 @@ def _grid(
         raise RecordingError(
             "contains no map: no nav_msgs/OccupancyGrid except costmaps",
             where=where,
-            remedy="give it as --map map.yaml, or leave out --by",
+            remedy="give a map as --map map.yaml, or leave out --by",
         )
     if poses is None:
         raise RecordingError(
@@ -209,9 +209,9 @@ def _grid(
 def _scanned(
     usable: list[PlacedScans], poses: Poses, room_m: float
 ) -> tuple[OccupancyGrid, float, str, list[str]]:
-    """Map the scans by header stamps, or by log time if they agree better so.
+    """Map the scans by header stamps, or by log time if they agree clearly better that way.
 
-    Returns the map, the share of the scans' ends that agree on it, their source, and notes.
+    Returns the map, the scans' agreement (`scan_map`), their source, and notes.
     """
     best: tuple[OccupancyGrid, float, str, list[str]] | None = None
     for scans in usable:
@@ -220,7 +220,7 @@ def _scanned(
         notes.append(
             f"{len(scans):,} {scans.source} were used, and {agree:.0%} of their ends are within a "
             "cell of a wall of the combined map"
-            + ("" if agree >= AGREEING else ": poses or clocks are off, do not trust it")
+            + ("" if agree >= AGREEING else ": poses or clocks are off, do not trust this map")
         )
         if best is None or agree > best[1] + CLOCKS_APART:
             best = grid, agree, scans.source, notes
@@ -240,7 +240,7 @@ def _check_frames(
     """Check that the poses lie on the map; note the share that does not.
 
     Raises:
-        ConfigError: most do not.
+        ConfigError: most poses do not.
     """
     if poses is None:
         notes.append("the robot's pose is not known: missions start and end wherever there is room")
@@ -254,13 +254,13 @@ def _check_frames(
     )
     frames = ""
     if grid.frame and poses.frame and grid.frame != poses.frame:
-        frames = f"; the map is in frame {grid.frame!r}, they are in {poses.frame!r}"
+        frames = f"; the map is in frame {grid.frame!r}, the poses are in {poses.frame!r}"
     if off + walls + unknown > MAX_OFF:
         raise ConfigError(
-            f"{said}, and {int((found == FREE).sum()):,} on its free floor{frames}: it is not a"
-            " map of these poses",
+            f"{said}, and {int((found == FREE).sum()):,} on its free floor{frames}: the map does"
+            " not belong to these poses",
             where=f"{where}, {source}",
-            remedy="give the map in which they were localised (--map map.yaml), or a --profile "
+            remedy="give the map that the robot localised in (--map map.yaml), or a --profile "
             "with a pose in the map's frame, or make the floor --by scans or --by corridor",
         )
     if off + walls + unknown >= 0.01 or frames:
@@ -270,10 +270,10 @@ def _check_frames(
 def _check_walls(
     grid: OccupancyGrid, scans: list[PlacedScans], source: str, where: str, notes: list[str]
 ) -> None:
-    """Check that the map's walls are where the lidar saw them; note it if many are not.
+    """Check that the lidar's returns are on the map's walls; note it if many are not.
 
     Raises:
-        ConfigError: most are not.
+        ConfigError: most returns are not.
     """
     by_clock = [returns_on_walls(one, grid) for one in scans]
     agree = max((share for share in by_clock if share is not None), default=1.0)
@@ -282,20 +282,20 @@ def _check_walls(
         raise ConfigError(
             f"only {said}: it is not a map of this place, or the poses are in another frame",
             where=f"{where}, {source}",
-            remedy="give the map in which they were localised (--map map.yaml), or a --profile "
+            remedy="give the map that the robot localised in (--map map.yaml), or a --profile "
             "with a pose in the map's frame, or make the floor --by scans (--by map uses this map "
-            "all the same)",
+            "without this check)",
         )
     if agree < SEEN:
         notes.append(f"only {said}: the poses are imprecise, or the place has changed since")
 
 
-MIN_SIDE_M = 2.0  # of a floor that is worth quartering
+MIN_SIDE_M = 2.0  # smaller floors are not divided into quarters
 _QUARTERS = (("south", "west"), ("south", "east"), ("north", "west"), ("north", "east"))
 
 
 def with_zones(floor: Warehouse) -> Warehouse:
-    """Add a floor's crossings as zones beside its aisles, or its quarters if it has no aisles."""
+    """Add a floor's crossings to its zones, or its quarters if it has no aisles."""
     if floor.segments:
         named = ((f"crossing_{k + 1}", area) for k, area in enumerate(floor.crossings))
         return replace(floor, cross_zones=tuple(named))
