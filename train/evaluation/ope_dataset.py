@@ -162,10 +162,7 @@ def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
 
 
 def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
-    """Open the store of the logs; return it with the IDs of its rows, or a panel's held-out ones.
-
-    `logs` None means the `trained` panel.
-    """
+    """Open the store of the logs; return it with its rows' IDs, or a panel's held-out ones."""
     panel: Panel | None = trained
     if logs is not None:
         location = Location.of(logs)

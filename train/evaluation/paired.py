@@ -25,10 +25,7 @@ Episodes = dict[Cell, dict[Key, tuple[float, float]]]  # success (NaN without a 
 
 
 def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
-    """Read the episodes that `restock eval` drove with a run's policy; None if there are none.
-
-    `policy` names another policy of the same evaluation.
-    """
+    """Read the episodes that `policy` drove in a run's `restock eval`; None if there are none."""
     table, _ = shown_evaluation(run.path)
     driven = table.filter(pc.equal(table["policy"], policy))
     return driven if len(driven) else None

@@ -241,10 +241,7 @@ def _near_slip(rows: FedRows) -> Bools:
 
 
 def _on_ice(rows: FedRows, moves: F64) -> Bools:
-    """Return which rows (N,) are of episodes with slip, in recordings that also move without it.
-
-    `moves` (N,) is the motion of each row.
-    """
+    """Return which rows (N,) are of episodes with slip, in recordings that also move without it."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
@@ -290,10 +287,7 @@ def _gained(rows: FedRows) -> F64:
 
 
 def _turned_waypoint(rows: FedRows) -> F64:
-    """Return the yaw rate (rad/s) that explains the change of the near waypoint's bearing.
-
-    NaN if the robot drove or the plan was replaced, which move the waypoint, too.
-    """
+    """Return the yaw rate (rad/s) by the near waypoint's bearing; NaN if driving or replanning."""
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
     change = (after - now + np.pi) % (2 * np.pi) - np.pi

@@ -71,10 +71,9 @@ class Part:
 def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
     """Split rows into parts: all rows, then each robot's and recording's if several are large.
 
-    If all recordings are tagged with a robot and there are several robots, each robot is a part.
-    Recordings are parts, too, if each has `MIN_ROWS` rows; without robots, shorter recordings are
-    grouped with those that started around the same time. The comparison counts what was compared;
-    it is None if there is one recording.
+    Robots are parts if all recordings are tagged with one of several. Recordings are parts, too, if
+    each has `MIN_ROWS` rows. Without robots, shorter recordings are grouped with those that started
+    around the same time. The comparison counts the parts; it is None if there is one recording.
     """
     parts = [Part("", "", logs)]
     recordings, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
@@ -122,8 +121,7 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
     np.minimum.at(start, place, logs.logged_ns)
     order = np.argsort(start, kind="stable")
     middle = np.cumsum(rows[order]) - rows[order] / 2
-    # A group may lose half of a recording at either end to its neighbours.
-    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # ends may lose half of two
     begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
     named = np.empty(len(names), object)
     for first, end in pairwise(begins.tolist()):
@@ -134,10 +132,7 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
 def _of_parts(
     parts: Sequence[Part], each: Sequence[Sequence[Finding]], files: Mapping[str, str]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Merge the findings of all parts: return those of some robots or recordings, then of all rows.
-
-    `each` has the findings of each part; `files` maps recordings to file names.
-    """
+    """Merge the parts' findings: return those of some robots or recordings, then of all rows."""
     found = list(each[0])
     kinds = {one.kind: sum(other.kind == one.kind for other in parts) for one in parts[1:]}
     by_cause: dict[tuple[str, str, int], list[tuple[Part, Finding]]] = {}

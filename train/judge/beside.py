@@ -21,7 +21,7 @@ from restock.train.judge.fed_rows import Comparison, FedRows, judged, shares_com
 from restock.train.judge.row_checks import implied_reward
 
 MIN_BESIDE = 4  # robots or recordings, of which one can be the odd one out
-_ALIKE = 0.75  # share of the other robots that must agree, to serve as the reference
+_ALIKE = 0.75  # least share of the other robots that must agree with their median
 GAIN = 1.02  # largest gain over the others', or its inverse, for two sensors of one motion
 ANSWER, NOISY = 1.15, 1.25  # the same for responses to commands, and for all other relations
 _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences; the latter of y's mean square
@@ -207,8 +207,7 @@ class Stretches:
         """Cut a robot's rows, without those that slip and stretches with under half their rows."""
         x, measured = relation.of(rows)
         expected = lagged(x, [rows.before(int(lag)) for lag in relation.lags]) @ kernel + offset
-        # Rows with a wrong pose are labelled as slip, too, but there the pose moves more than the
-        # wheels turn.
+        # Rows with a wrong pose are labelled as slip, too, but it moves more than the wheels turn.
         slips = np.abs(rows.after("localised_speed")) < np.abs(rows.after("wheel_speed"))
         if ends.WHEEL_TURN in (relation.x, relation.y):
             slips = np.abs(rows.after("gyro_yaw_rate")) < np.abs(wheel_turn(rows))
@@ -317,7 +316,7 @@ _EQUAL = 1e-5  # of a signal's spread: smaller differences are none
 _SAME = 1e-4  # m/s or rad/s: smaller differences between two signals are none
 _MIN_DRIVEN = 100  # rows of a driver
 _LESS = 0.9  # a limit counts below this share of the others' median
-_UNSEEN = 0.999  # lidar entries from here on saw nothing
+_UNSEEN = 0.999  # lidar entries of at least this saw nothing
 _JUMP, _STILL = 0.15, 0.05  # a flicker differs from both neighbours; these hardly differ
 _EXACT = 2e-3  # largest error of a reward that is the task's own
 
@@ -380,8 +379,7 @@ def _repeats(
 ) -> Iterator[Tally]:
     """Count how the values (N,) of a signal repeat in `known` rows.
 
-    `before` is the index of each row's predecessor. Values that are `copied` do not count as
-    rounded.
+    `before` is the index of each row's predecessor. `copied` values do not count as rounded.
     """
     finite = np.where(np.isfinite(value), value, 0.0)
     step = _EQUAL * max(float(np.subtract(*np.quantile(finite[known], [0.95, 0.05]))), 1e-9)
@@ -408,11 +406,7 @@ def _repeats(
 
 
 def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
-    """Yield signals that may repeat another one.
-
-    Each comes with the rows (N,) in which it moves, those in which it also equals the other, and
-    the other's name.
-    """
+    """Yield signals that may copy another: name, moving rows (N,), copied rows, other's name."""
     speed, turn = rows.command().T
     for signal, value, other, of in (
         (ends.WHEEL_SPEED, rows.after("wheel_speed"), speed, "the command"),

@@ -133,10 +133,7 @@ def _ratios(cells: Sequence[str], name: str, a: F64, b: F64) -> list[Check]:
 
 
 def _unlabelled(first: Feed, second: Feed) -> list[Check]:
-    """Check the share of fresh rows drawn before they had labels; any condition may be among them.
-
-    The list is empty if the share is within its limit in both feeds.
-    """
+    """Check the share of fresh rows drawn before they had labels, if it is large in a feed."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
     for feed in (first, second):

@@ -187,9 +187,7 @@ def _total(name: str, first: float, second: float) -> Check:
 
 
 def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
-    """Return the source of the episodes, and an outcome per cell that both arms drove.
-
-    A cell is a perturbation and a condition.
+    """Return the source of the episodes, and an outcome per condition and perturbation of both.
 
     Raises:
         RunError: a run has no evaluation, or the arms share no episode.
@@ -323,10 +321,7 @@ def diff_runs(a: Run, b: Run) -> dict[str, Any]:
 
 
 def _panels(a: Run, b: Run) -> dict[str, Any] | None:
-    """Compare the runs' panels; None if they are the same or a run has none.
-
-    If a panel cannot be opened or was replaced, only a note about that is returned.
-    """
+    """Compare the runs' panels; None if they are equal or missing; a note if one was replaced."""
     fed = [run.document.get("panel") or {} for run in (a, b)]
     if not all(fed) or fed[0].get("id") == fed[1].get("id"):
         return None

@@ -260,10 +260,7 @@ class FedRows:
         return np.asarray(np.cumsum(~self.joined), np.int64)
 
     def before(self, lag: int) -> tuple[Ints, Bools]:
-        """Return the index (N,) of the row `lag` steps earlier, and whether there is one (N,).
-
-        A negative lag means later rows.
-        """
+        """Return the row index (N,) `lag` steps earlier (later if < 0), and whether it exists."""
         place = np.arange(len(self)) - lag
         inside = np.clip(place, 0, max(len(self) - 1, 0))
         known = (place == inside) & (self._stretch[inside] == self._stretch)
@@ -490,10 +487,7 @@ def drive_twin(
 def _ended(
     task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
 ) -> FedRows:
-    """Return the rows of episodes that ended, robot by robot, from T steps of N robots.
-
-    Episodes with an invalid step are left out.
-    """
+    """Return the rows of valid episodes that ended, robot by robot, from T steps of N robots."""
     steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
     flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
     ended = steps["ended"]

@@ -233,7 +233,7 @@ def _ranges(
         least, most = _expected(rows.task, floor, rows.pose[kept], by)
         shown = (least > 0.1) & (least < _NEARBY * rows.task.range_max_m) & (most - least < 0.6)
         if twin is not None:
-            shown &= (twin.sectors() < 1.0).any(axis=0)  # not covered by the twin's lidar
+            shown &= (twin.sectors() < 1.0).any(axis=0)  # those that the twin's lidar covers
         off = clearance - least
         near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
         if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
@@ -317,10 +317,7 @@ def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
 
 
 def _stretches(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
-    """Return the stretch of each row (N,), and each stretch's driver.
-
-    A stretch has consecutive rows of one driver in one episode.
-    """
+    """Return each row's stretch (N,), of one driver in one episode, and each stretch's driver."""
     assert rows.driver is not None
     begins = np.append(True, (np.diff(rows.episode) != 0) | (rows.driver[1:] != rows.driver[:-1]))
     return np.cumsum(begins) - 1, rows.driver[begins]
@@ -341,10 +338,7 @@ def _style(rows: FedRows) -> F64:
 
 
 def _best_move(floor: Warehouse, places: F64) -> F64:
-    """Return the move (2,) with which places fit a floor's walls best, to `_FINE_M`.
-
-    Longer moves have a small penalty.
-    """
+    """Return the move (2,) with which places fit walls best; longer ones have a small penalty."""
     places = places[:: len(places) // _RETURNS + 1]
     best = np.zeros(2)
     for step, reach in ((_STEP_M, _SEARCH_M), (_FINE_M, _STEP_M)):

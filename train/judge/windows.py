@@ -143,10 +143,7 @@ class Window:
         return reasons
 
     def target(self) -> list[str]:
-        """Return in words which figures put the target in doubt; empty if none does.
-
-        An L that is NaN is past its limit.
-        """
+        """Return in words which figures put the target in doubt; a NaN in L does, too."""
         reasons = []
         if self.lag < LIMITS.no_lag:
             reasons.append(
@@ -187,10 +184,7 @@ class Window:
 
 
 def median_window(windows: Sequence[Window]) -> Window:
-    """Return the median of each figure over windows; None values are ignored.
-
-    The number of updates and the |Q| are those of the last window.
-    """
+    """Return each known figure's median over windows; updates and |Q| are the last window's."""
 
     def middle(name: str, of: Sequence[Any] = windows) -> Any:
         known = [value for item in of if (value := getattr(item, name)) is not None]

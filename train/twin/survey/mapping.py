@@ -349,10 +349,7 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
 
 
 def way_between(places_m: F64) -> F64:
-    """Return places (N, 2) and, appended, points less than a cell apart between successive ones.
-
-    Jumps are not filled.
-    """
+    """Append points to places (N, 2), under a cell apart, between successive ones; not in jumps."""
     parts = [places_m]
     length = np.hypot(*np.diff(places_m, axis=0).T)
     for index in np.flatnonzero((length > CORRIDOR_CELL_M / 2) & (length <= JUMP_M)):
