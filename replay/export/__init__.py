@@ -1,6 +1,6 @@
-"""Transitions as data sets of other libraries."""
+"""Export transitions as data sets of other libraries."""
 
-# name -> (module, what must be installed, what a file's name must end with or "" for a directory)
+# name -> (module, library that it needs or "", ending of the file's name or "" for a directory)
 FORMATS: dict[str, tuple[str, str, str]] = {
     "minari": ("minari_hdf5", "minari", ""),
     "d3rlpy": ("one_file", "h5py", ".h5"),

@@ -1,7 +1,7 @@
-"""The rows of a store or a panel as another library's data set.
+"""Export the rows of a store or a panel as another library's data set.
 
-Each format is a function `write_FORMAT(selection, trajectories, out, counts)`, which returns notes
-for the user; what it needs from elsewhere is imported there, so that only the format asked for must
+Each format has a function `write_FORMAT(selection, trajectories, out, counts)`, which returns notes
+for the user. It imports the library that it needs, so that only the requested format's library must
 be installed.
 """
 
@@ -28,8 +28,8 @@ from restock.replay.export.trajectory import (
 )
 
 WITH_IMAGES = "lerobot"
-# The HDF5 library crashes where it cannot write what it holds back when a file is closed. That is
-# less than this: its caches of metadata, and of chunks.
+# The HDF5 library crashes if the disk is full when it flushes its caches of metadata and chunks as
+# a file is closed. These caches are smaller than this.
 ROOM_BYTES = 64 << 20
 
 
@@ -45,20 +45,22 @@ def export_dataset(
     cameras: Sequence[str] | None = None,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
-    """Write a data set; all or nothing.
+    """Write a data set, all or nothing.
 
     Args:
-        source: a store or a panel. to: one of FORMATS. out: a file or directory that must not exist
-        yet. query, panel, continuous: see `open_selection`. cameras: whose frames go with the
-        steps, of a store to lerobot; None: all that it has. advance: called with the number of
-        steps written so far.
+        source: a store or a panel.
+        to: one of FORMATS.
+        out: a file or directory that must not exist yet.
+        query, panel, continuous: see `open_selection`.
+        cameras: cameras whose frames are exported, for lerobot only; None: all of the store.
+        advance: called with the number of steps just written.
 
-    Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
-    set carries.
+    Returns `format`, `path`, the counts of `Counts`, `notes`, and the provenance that is also
+    written into the data set.
 
     Raises:
-        StoreError: an unknown format, something at `out`, no rows, a disk too full for HDF5.
-        ConfigError: a library that is not installed.
+        StoreError: an unknown format, something at `out`, no rows, or a disk too full for HDF5.
+        ConfigError: a library is not installed.
         PanelError, QueryError: see `open_selection`.
     """
     module, needs, ending = FORMATS.get(to, ("", "", ""))
@@ -133,7 +135,7 @@ def _advancing(
 
 
 def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
-    """Raise StoreError before the disk is full."""
+    """Pass trajectories on, and raise StoreError before the disk is full."""
     for trajectory in episodes:
         free = shutil.disk_usage(out.parent).free
         if free < ROOM_BYTES + 2 * trajectory.observations.nbytes:

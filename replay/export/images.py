@@ -1,7 +1,7 @@
-"""A camera's frames as an image feature of LeRobot: one picture a step, by episode.
+"""A camera's frames as an image feature of LeRobot: one picture per step, by episode.
 
-JPEG and PNG of three colours go out byte for byte as they were recorded. Others become PNG without
-loss of what three channels of 8 bits can hold; deeper images (depth) are refused.
+JPEG and PNG with three channels of 8 bits are exported byte for byte as recorded. Other images are
+converted to RGB and encoded as PNG. Images with more than 8 bits per channel (depth) are refused.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from restock.replay.export.trajectory import Trajectory
 from restock.replay.store.frames import CameraFrame, camera_frames, cameras_of
 from restock.replay.store.store import Store
 
-SAMPLES = 100  # pictures of an episode that its statistics are of, as LeRobot's
-SMALL_PX = 150  # they are thinned to about so many
+SAMPLES = 100  # pictures per episode for statistics, as in LeRobot
+SMALL_PX = 150  # for statistics, the longer side is subsampled to about this size
 
 
 @dataclass
 class ImageFeature:
-    """What `observation.images.CAMERA` of a data set is, as its frames go by."""
+    """The feature `observation.images.CAMERA` of a data set, and counts of its pictures so far."""
 
     camera: str
-    shape: tuple[int, int] | None = None  # height, width
-    as_recorded: int = 0  # pictures whose bytes are the recording's
-    packed: Counter[str] = field(default_factory=Counter)  # others, by what they were
+    shape: tuple[int, int] | None = None  # height, width; None before the first picture
+    as_recorded: int = 0  # pictures exported byte for byte
+    packed: Counter[str] = field(default_factory=Counter)  # original encoding -> pictures as PNG
 
     @property
     def name(self) -> str:
@@ -45,15 +45,16 @@ class ImageFeature:
         return {"dtype": "image", "shape": [height, width, 3], "names": names}
 
     def note(self) -> str:
-        """Describe in words how the camera's pictures were exported."""
+        """Return the note on how the camera's pictures were exported."""
         packed = "".join(f"; {count:,} of {what} as PNG" for what, count in self.packed.items())
         return f"{self.name}: {self.as_recorded:,} pictures as they were recorded{packed}"
 
     def picture(self, frame: CameraFrame) -> tuple[bytes, NDArray[np.uint8] | None]:
-        """Return a frame as a file, and its pixels if they were decoded for that.
+        """Return a frame as an encoded file, and its pixels if it was re-encoded.
 
         Raises:
-            StoreError: it has another size than those before, or more than 8 bits a channel.
+            StoreError: the frame has another size than earlier ones, or more than 8 bits per
+                channel.
         """
         layout = frame.layout
         size = (layout.height, layout.width)
@@ -82,7 +83,7 @@ class ImageFeature:
 
 
 def colours(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return pixels as (H, W, 3): grey repeated three times, without alpha."""
+    """Convert pixels to (H, W, 3): repeat grey three times, drop alpha."""
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., :3], np.uint8)
@@ -97,7 +98,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 
 def chosen_cameras(store: Store, named: Sequence[str] | None) -> list[str]:
-    """Return the cameras whose frames are exported: those named, or all (None).
+    """Return the cameras whose frames are exported: `named`, or all if it is None.
 
     Raises:
         StoreError: the store has no such camera.
@@ -117,11 +118,11 @@ def pictures(
 ) -> Iterator[tuple[ImageFeature, list[dict[str, Any]], NDArray[np.uint8]]]:
     """Yield each camera's pictures of a trajectory, one per step (T).
 
-    For each camera: the feature, the encoded pictures as rows of a LeRobot column, and a few
-    thinned ones for statistics, (N, h, w, 3).
+    For each camera: the feature, the encoded pictures as rows of a LeRobot column, and subsampled
+    pixels of up to SAMPLES pictures for statistics, (N, h, w, 3).
 
     Raises:
-        StoreError: as `ImageFeature.picture`, or a damaged frame.
+        StoreError: see `ImageFeature.picture`; or a frame is damaged.
     """
     if not features:
         return

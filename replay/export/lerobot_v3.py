@@ -1,14 +1,13 @@
 """LeRobot's dataset layout v3.0: `LeRobotDataset("restock/logs", root="OUT")`.
 
     meta/info.json  meta/stats.json  meta/tasks.parquet
-    meta/episodes/chunk-000/file-000.parquet    one row an episode: where it is, and its statistics
-    data/chunk-000/file-000.parquet             one row a frame, a row group an episode
-    meta/restock.json                           where it is from
+    meta/episodes/chunk-000/file-000.parquet    one row per episode: its frames, its statistics
+    data/chunk-000/file-000.parquet             one row per frame, one row group per episode
+    meta/restock.json                           provenance
 
 A frame is an observation and the action taken there. The layout has no frame for the observation
-after the last action, so `next.observation.state` keeps it in every frame (not if a query chooses
-the state). A camera's frame in force at a step is its `observation.images.CAMERA`, a file in the
-table.
+after the last action, so every frame has `next.observation.state`, unless a query chooses the
+state. `observation.images.CAMERA` is the encoded picture that was the camera's latest at the step.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ from restock.replay.export.trajectory import STATE, Counts, Trajectory, fixed_li
 CODEBASE_VERSION = "v3.0"
 TASK = "Drive along the planned route to its goal without touching anything."
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-OWN = "restock."  # columns about a frame, not of it: without statistics
+OWN = "restock."  # prefix of our own columns, which get no statistics
 PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-FILE = PATTERN.format(chunk_index=0, file_index=0)  # the only one
+FILE = PATTERN.format(chunk_index=0, file_index=0)  # the only file
 
-PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # as `datasets` has images
+PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # image type of `datasets`
 Stats = dict[str, dict[str, NDArray[np.float64]]]
 
 
@@ -124,7 +123,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
     """Return an episode's columns, (T,) or (T, k) each."""
     steps = np.arange(len(t))
     last = steps == len(t) - 1
-    chosen = t.carried.get(STATE)  # what it is after the last step, no row says
+    chosen = t.carried.get(STATE)  # unknown after the last step, so without `next.`
     return {
         STATE: t.observations[:-1] if chosen is None else chosen.astype(np.float32),
         "action": t.actions,
@@ -198,11 +197,11 @@ def _image_stats(images: NDArray[np.uint8]) -> dict[str, NDArray[np.float64]]:
 
 
 def _together(every: list[Stats]) -> Stats:
-    """Merge the episodes' statistics; quantiles are means of theirs, as in LeRobot."""
+    """Merge the episodes' statistics; quantiles are averaged, as in LeRobot."""
     whole: Stats = {}
     for name in every[0]:
         parts = {kind: np.stack([stats[name][kind] for stats in every]) for kind in every[0][name]}
-        weight = parts["count"] / parts["count"].sum()  # (episodes, 1), or as wide as images'
+        weight = parts["count"] / parts["count"].sum()  # (episodes, 1)
         weight = weight.reshape(-1, *[1] * (parts["mean"].ndim - 1))
         mean = (parts["mean"] * weight).sum(axis=0)
         variance = ((parts["std"] ** 2 + (parts["mean"] - mean) ** 2) * weight).sum(axis=0)

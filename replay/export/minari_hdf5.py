@@ -1,7 +1,7 @@
 """A Minari data set: `minari.MinariDataset("OUT")`, or `minari.load_dataset` from its data folder.
 
-`infos` are per observation, T + 1 as Minari has them: entry t is of the transition that begins
-there, the last one is empty (-1, "" or NaN).
+`infos` have one entry per observation, T + 1 as in Minari. Entry t describes the transition that
+begins there; the last entry is empty (-1, "" or NaN).
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ def write_minari(
 
 
 def _twin(selection: Selection) -> Any:
-    """Return the twin's spec, where it runs the very task of these rows; else none."""
+    """Return the twin's environment spec if it has the same task as these rows, else None."""
     if load_profile(TWIN_PROFILE).task.hash != selection.task.hash:
         return None
-    spec = copy.deepcopy(gymnasium.spec(TWIN))  # the registry's own must stay as it is
+    spec = copy.deepcopy(gymnasium.spec(TWIN))  # must not change the registry's spec
     spec.kwargs = {"action": "continuous"} if selection.continuous else {}
     return spec
 

@@ -1,12 +1,12 @@
-"""Data sets of one file: Parquet, and d3rlpy's own dump of episodes (HDF5).
+"""Data sets of one file: Parquet, and d3rlpy's dump of episodes (HDF5).
 
     with open("OUT.h5", "rb") as file:
         dataset = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
 
-d3rlpy keeps as many observations as steps, and takes no transition from the last step of an
-episode that did not terminate. So such an episode gets one closing step: the observation after its
-last step, that step's action again, reward 0. Nothing is lost, and the closing step itself gives
-no transition.
+d3rlpy stores as many observations as steps, and does not use the last step of an episode that did
+not terminate. So such an episode gets a closing step: the observation after its last step, that
+step's action again, and reward 0. Then no transition is lost, and the closing step itself is not
+used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from restock.replay.export.selection import Selection
 from restock.replay.export.trajectory import Counts, Trajectory, fixed_lists
 
 GROUP_ROWS = 16_384
-D3RLPY_VERSION = "2.1"  # of its format
+D3RLPY_VERSION = "2.1"  # version of its format
 D3RLPY_COLUMNS = ("observations", "actions", "rewards", "terminated")
 
 
@@ -81,7 +81,7 @@ def as_table(trajectory: Trajectory, number: int) -> pa.Table:
 def write_d3rlpy(
     selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
-    """Write episodes as d3rlpy dumps them."""
+    """Write episodes in d3rlpy's dump format."""
     import h5py  # type: ignore[import-untyped]
 
     number = -1
@@ -99,7 +99,7 @@ def write_d3rlpy(
             }
             for name in D3RLPY_COLUMNS:
                 file.create_dataset(f"{name}_{number}", data=values[name])
-            # Beside what d3rlpy reads: which transition each step was.
+            # Not read by d3rlpy: the transition of each step.
             group = file.require_group(f"restock/{number}")
             group.attrs.update(
                 {"episode_id": t.episode_id, "first_step": t.first_step, "cut": t.cut}

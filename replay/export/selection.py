@@ -1,4 +1,4 @@
-"""What is exported: the rows of a query to a store, or those that a panel took from it."""
+"""Select the rows to export: those of a query to a store, or those of a panel."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class Selection:
     task: Task
     continuous: bool
     command_range: tuple[F64, F64]  # low and high (2,) of the actions
-    provenance: dict[str, Any]  # of the data set, as JSON
-    store: Store  # that the rows are of
-    cameras: tuple[str, ...] = ()  # each row has a frame of each
-    left_out: Mapping[str, int] = field(default_factory=dict)  # rows, by reason
-    by_name: bool = False  # each row has a state of chosen numbers
+    provenance: dict[str, Any]  # source of the data set, as JSON values
+    store: Store  # the store of the rows
+    cameras: tuple[str, ...] = ()  # every row has a frame of each camera
+    left_out: Mapping[str, int] = field(default_factory=dict)  # reason -> number of rows
+    by_name: bool = False  # the query defines STATE, which replaces the task's observation
 
     @property
     def observation_size(self) -> int:
@@ -66,18 +66,18 @@ def open_selection(
     continuous: bool = False,
     cameras: Sequence[str] | None = (),
 ) -> Iterator[Selection]:
-    """Yield the rows of a query to a store, or those that a panel took from its store.
+    """Open the rows of a query to a store, or the rows of a panel in its store.
 
     Args:
-        path: a store, at a version if it is `store@12`, or a panel.
-        query: SQL over the store's views that gives whole transitions; default all of them.
-        panel: whose tables the query may use: `panel.rows`, `panel.strata`.
-        continuous: the action is the command that was logged, not the index of the nearest.
-        cameras: of a store: rows without a frame of each are left out; None: every camera.
+        path: a store (`store@12` for a version), or a panel.
+        query: SQL over the store's views that returns whole transitions; default: all.
+        panel: a panel whose tables the query may use: `panel.rows`, `panel.strata`.
+        continuous: export the logged command as action, not the index of the nearest action.
+        cameras: leave out rows without a frame of each of these cameras; None: all cameras.
 
     Raises:
-        StoreError, PanelError: nothing there, rows of several tasks, no rows, no such camera.
-        QueryError: a query that does not run or lacks columns.
+        StoreError, PanelError: no store or panel, rows of several tasks, no rows, unknown camera.
+        QueryError: the query does not run or lacks columns.
     """
     if (Path(path) / HEADER).is_file():
         header = Panel.open(path).header
@@ -104,7 +104,7 @@ _SIZES = ("tinyint", "smallint", "integer", "bigint", "hugeint")
 _INTEGERS = frozenset(sign + size for sign in ("", "u") for size in _SIZES)
 _NUMBERS = _INTEGERS | {"float", "double", "decimal"}
 _LISTS = ("observation", "next_observation")
-# Of a column: DuckDB's types of its values, or of its lists' items, and what to call them.
+# Column -> allowed DuckDB types of its values or list items, and their name in error messages.
 _TYPES: dict[str, tuple[Collection[str], str]] = {
     **dict.fromkeys(("action", "step_index"), (_INTEGERS, "an integer")),
     **dict.fromkeys(("reward", *COMMAND), (_NUMBERS, "a number")),
@@ -179,7 +179,7 @@ def _of_query(
             where=where,
             remedy="export the actions as they are stored",
         )
-    # Episodes in the order they were driven, where the query says; else by their name.
+    # Episodes in the order they were driven if the query has these columns, else by id.
     driven = ["recording_id", "episode_index"]
     order = [*(driven if set(driven) <= set(columns) else []), "episode_id", "step_index"]
     carried = {name: name for name in CARRIED if name in columns}
@@ -227,7 +227,7 @@ def _with_frames(
     camera: str,
     where: str,
 ) -> tuple[str, int]:
-    """Return the query for rows with a frame of this camera, and the number of rows without."""
+    """Return the query restricted to rows with a frame of this camera, and the rows left out."""
     if "transition_id" not in columns:
         raise QueryError(
             "the query gives no transition_id, by which frames are found",
@@ -245,7 +245,7 @@ def _with_frames(
 def _fewer(
     connection: duckdb.DuckDBPyConnection, text: str, having: str, where: str, what: str = STATE
 ) -> int:
-    """Return how many rows of a query lack something; raise StoreError if all do."""
+    """Return how many rows of `text` are not in `having`; raise StoreError if that is all."""
     counts = [
         fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]
         for one in (text, having)
@@ -262,10 +262,10 @@ def _fewer(
 
 
 def _state(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str, str]:
-    """Return the SQL of each number in a query's `observation.state`, by name; {} without it.
+    """Return name -> SQL of each number in a query's `observation.state`; {} if it has none.
 
     Raises:
-        QueryError: it is something else than numbers by name.
+        QueryError: the column is not a struct of numbers.
     """
     if STATE not in columns:
         return {}
@@ -282,7 +282,7 @@ def _state(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str
 
 
 def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the robots of these recordings by id; untagged recordings are left out."""
+    """Return recording id -> tags; recordings without tags are left out."""
     rows = store.connection.execute(
         "SELECT recording_id, tags FROM recordings WHERE recording_id IN (SELECT unnest(?))"
         " AND cardinality(tags) > 0 ORDER BY recording_id",
@@ -294,9 +294,9 @@ def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
 def _batches(
     connection: duckdb.DuckDBPyConnection, relation: duckdb.DuckDBPyRelation, where: str
 ) -> Iterator[pa.RecordBatch]:
-    """Yield a query's rows as they come; Ctrl-C stops it.
+    """Yield a query's rows in batches; Ctrl-C stops it.
 
-    Raises QueryError for what goes wrong while it runs.
+    Raises QueryError if the query fails while it runs.
     """
     try:
         reader = interruptible(connection, lambda: relation.to_arrow_reader(BATCH_ROWS))

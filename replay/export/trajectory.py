@@ -1,8 +1,8 @@
-"""Transitions put back together into trajectories: what other libraries' formats hold.
+"""Join transitions to trajectories, which other libraries' formats contain.
 
-A trajectory is an unbroken run of steps of one episode with the observation after its last step.
-Where rows are missing (a query left them out) an episode becomes several, each ended
-by a cut: truncated, for its return continues beyond it.
+A trajectory is an unbroken sequence of steps of one episode, with the observation after its last
+step. If rows are missing (a query left them out), an episode becomes several trajectories. One with
+missing rows after it is cut: it counts as truncated, because its return would continue.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ REQUIRED = (
     *("terminated", "truncated"),
 )
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
-CARRIED = (  # of a row, where the query has it
+CARRIED = (  # exported if the query has them
     *("transition_id", "stamp_ns", "condition", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "action_residual", "robot", "site"),
 )
-STATE = "observation.state"  # of a query: numbers by name, in place of the task's observation
+STATE = "observation.state"  # query column: named numbers to export as the observation
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Trajectory:
     """T steps and the observation after them."""
 
     episode_id: str
-    first_step: int  # its place in the episode
+    first_step: int  # step_index of the first step
     observations: F32  # (T + 1, D)
     actions: NDArray[Any]  # (T,) int64, or (T, 2) float32: m/s and rad/s
     rewards: F32  # (T,)
     terminated: bool  # after the last step; else truncated
-    cut: bool  # truncated because the rows after it are not in the selection
-    carried: dict[str, NDArray[Any]]  # (T,) each; text as objects
+    cut: bool  # truncated because the selection lacks the rows after it
+    carried: dict[str, NDArray[Any]]  # column -> (T,); text has dtype object
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -55,14 +55,14 @@ class Trajectory:
 
     @property
     def whose(self) -> dict[str, str]:
-        """Return its robot and site, if the rows have them; an episode has one of each."""
+        """Return its robot and site, if the rows have them; they are the same in all steps."""
         said = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
         return {name: "" if value is None else str(value) for name, value in said.items()}
 
 
 @dataclass
 class Counts:
-    """What became of the rows read."""
+    """Counts of rows read, and of what they became."""
 
     rows: int = 0
     transitions: int = 0
@@ -71,10 +71,10 @@ class Counts:
     truncated: int = 0  # by the episode's own end
     cut: int = 0  # because rows are missing
     episodes: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)  # rows, by reason
+    left_out: Counter[str] = field(default_factory=Counter)  # reason -> number of rows
 
     def describe(self) -> dict[str, Any]:
-        """Return the result as plain values for JSON."""
+        """Return the counts as plain values for JSON."""
         names = ("rows", "transitions", "trajectories", "episodes", "terminated", "truncated")
         return {name: getattr(self, name) for name in names} | {
             "cut": self.cut,
@@ -87,16 +87,16 @@ def trajectories(
 ) -> Iterator[Trajectory]:
     """Yield trajectories from rows sorted by episode and step.
 
+    It keeps one batch and one episode in memory.
+
     Args:
-        batches: rows with the columns of REQUIRED; of COMMAND too, for continuous actions.
+        batches: rows with the columns of REQUIRED, and of COMMAND for continuous actions.
         continuous: actions are commands, not indices.
-        counts: filled on the way.
+        counts: updated while it runs.
         where: the source, for errors.
 
-    Memory: one batch and one episode.
-
     Raises:
-        StoreError: a step of an episode that comes twice, or observations of several sizes.
+        StoreError: a step occurs twice, observations have several sizes, or values are missing.
     """
     left: pa.Table | None = None
     for batch in batches:
@@ -114,7 +114,7 @@ def trajectories(
 
 
 class _Rows:
-    """Rows as arrays."""
+    """The columns of a table of rows as checked arrays."""
 
     def __init__(self, table: pa.Table, continuous: bool, where: str) -> None:
         self.where = where
@@ -201,7 +201,7 @@ def count_episodes(trajectories: Iterable[Trajectory], counts: Counts) -> Iterat
 
 
 def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
-    """Return a list column (n lists) as (n, D) float32. Raises StoreError where lengths differ."""
+    """Convert a list column to (n, D) float32. Raises StoreError if lengths differ."""
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         array = array.combine_chunks()
@@ -218,7 +218,7 @@ def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
 
 
 def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
-    """Return a column that must not have nulls."""
+    """Return a column as an array; raise StoreError if it has nulls."""
     if count := table[name].null_count:
         raise StoreError(
             f"{count} rows have no {name}", where=where, remedy=f"add WHERE {name} IS NOT NULL"
@@ -227,18 +227,18 @@ def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
 
 
 def _plain(table: pa.Table, name: str) -> NDArray[Any]:
-    """Return a scalar column; whole numbers with nulls become float64, text objects."""
+    """Return a scalar column; integers with nulls become float64, text becomes objects."""
     values: NDArray[Any] = table[name].to_numpy()
     return values
 
 
 def missing_columns(columns: Sequence[str], *, continuous: bool) -> list[str]:
-    """Return the needed columns that are missing."""
+    """Return the columns that an export needs and these lack."""
     needed = (*REQUIRED, *COMMAND) if continuous else REQUIRED
     return [name for name in needed if name not in columns]
 
 
 def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
-    """Return (n, k) float32 as n lists of k."""
+    """Convert (n, k) float32 to n lists of k."""
     flat = np.ascontiguousarray(values, np.float32).ravel()
     return pa.FixedSizeListArray.from_arrays(pa.array(flat), values.shape[1])

@@ -128,7 +128,7 @@ HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
         (changed(0, next_observation=[1.0]), "next observation of row 0 does not have 4 entries"),
         (changed(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
         (lambda: table(HALVES, "after"), "is not a whole number from 0 to 32,767"),
-        (changed(5, action=-1), "the action of row 5 is no whole number"),
+        (changed(5, action=-1), "the action of row 5 is not a whole number"),
         (changed(4, truncated=True), "row 5 follows the end of its episode"),
         (changed(6, condition=None), "1 rows have no coverage label"),
         (lambda: table([{**row, "condition": 1} for row in ROWS]), "condition must be text"),
