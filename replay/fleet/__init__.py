@@ -1,1 +1,1 @@
-"""A fleet's questions: what drifted, what differs between two stores or panels, what to log."""
+"""Analyse a fleet's stores: drift, differences of two stores or panels, and what to log next."""

@@ -1,4 +1,4 @@
--- What two stores have of each recording, episode and row: `a` and `b` are the schemas of their views.
+-- Compares the recordings, episodes and rows of two stores, whose views are in the schemas `a` and `b`.
 CREATE TEMP VIEW both_rows AS
 SELECT 'a' AS side, transition_id, recording_id, episode_id, episode_index, step_index, stamp_ns, action,
     reward, terminated, truncated, observation::FLOAT[] AS observation,
@@ -10,7 +10,7 @@ SELECT 'b', transition_id, recording_id, episode_id, episode_index, step_index, 
     conditions
 FROM b.transitions;
 
--- An ingest is written once and never changed, so rows of the same ingest are the same, unread.
+-- An ingest is written once and never changes, so rows with the same ingest_id are equal without reading.
 CREATE TEMP TABLE recording_pairs AS
 SELECT
     recording_id,
@@ -24,7 +24,7 @@ SELECT
 FROM a.recordings AS one
 FULL JOIN b.recordings AS other USING (recording_id);
 
--- Only what was written again is read whole; a match of all columns is a match of the episode.
+-- All columns are compared only for recordings that were written again, by a hash per episode.
 CREATE TEMP TABLE episode_pairs AS
 WITH episodes AS (
     SELECT
@@ -44,7 +44,7 @@ WITH episodes AS (
     WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
     GROUP BY ALL
 ), numbered AS (
-    -- A clock that was set back can begin two episodes at one stamp.
+    -- If a clock was set back, two episodes can begin at the same stamp.
     SELECT *, row_number() OVER (
         PARTITION BY side, recording_id, start_ns ORDER BY episode_index
     ) AS place
@@ -69,7 +69,7 @@ SELECT
 FROM (FROM numbered WHERE side = 'a') AS one
 FULL JOIN (FROM numbered WHERE side = 'b') AS other USING (recording_id, start_ns, place);
 
--- Rows of both, where one was written again: by id, else by recording and stamp.
+-- Pairs of equal steps in recordings that were written again: by id, else by recording and stamp.
 CREATE TEMP TABLE row_pairs AS
 WITH again AS (
     SELECT side, transition_id, recording_id, stamp_ns, episode_id, condition, conditions
@@ -86,7 +86,7 @@ WITH again AS (
         other.conditions AS conditions_b
     FROM (FROM again WHERE side = 'a') AS one
     JOIN (FROM again WHERE side = 'b') AS other USING (transition_id)
-    WHERE abs(one.stamp_ns - other.stamp_ns) < 500_000_000 -- else the steps are others: a new clock
+    WHERE abs(one.stamp_ns - other.stamp_ns) < 500_000_000 -- else the id is of another step: a new clock
 ), others AS (
     SELECT side, recording_id, stamp_ns, any_value(episode_id) AS episode_id,
         any_value(condition) AS condition, any_value(conditions) AS conditions
@@ -101,7 +101,7 @@ SELECT recording_id, other.episode_id, one.condition, other.condition, one.condi
 FROM (FROM others WHERE side = 'a') AS one
 JOIN (FROM others WHERE side = 'b') AS other USING (recording_id, stamp_ns);
 
--- Those that differ: the same rows under another ingest are no difference.
+-- Recordings that differ. Equal rows with another ingest_id do not count as a difference.
 CREATE TEMP VIEW recording_changes AS
 SELECT * FROM (
     SELECT
@@ -160,7 +160,7 @@ SELECT
     ) AS rows_with_other_changes
 FROM row_pairs;
 
--- Of `share_values` (made in store_difference.py): the value of each column that is compared, a row a step.
+-- Shares of each value, by column. `share_values` (store_difference.py) has a row per step and column.
 CREATE TEMP VIEW share_changes AS
 WITH counted AS (
     SELECT place, "of", value, count(*) FILTER (side = 'a') AS rows_a, count(*) FILTER (side = 'b') AS rows_b
@@ -179,7 +179,7 @@ FROM shared
 QUALIFY count(*) OVER (PARTITION BY "of") > 1 OR value <> '(none)'
 ORDER BY place, value;
 
--- Conditions whose definition differs, and labels, profiles and software of the rows.
+-- Conditions with different definitions, and different versions of labels, profiles and software.
 CREATE TEMP VIEW definition_changes AS
 SELECT
     'condition ' || condition AS what,

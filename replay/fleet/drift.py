@@ -1,6 +1,6 @@
-"""Drift of a store: its tests, what they found, and the weeks behind them.
+"""Drift of a store: statistical tests, their findings, and the data by period.
 
-The statistics are SQL (replay/store/drift.sql); here they run once, for a table or a page.
+The statistics are in SQL (replay/store/drift.sql). This module runs them for a table or a report.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Drift:
-    """What `measure_drift` found. Columns of the rows are documented in docs/sql.md."""
+    """The result of `measure_drift`. Columns of the rows are documented in docs/sql.md."""
 
     store: str
     version: int
     every: str  # day, week, …
-    reference: int  # of these periods
+    reference: int  # number of first periods that form a robot's reference
     least_episodes: int  # on each side of a comparison
-    findings: Rows  # as of the view drift_findings: what changed, the largest first
-    tests: Rows  # as of the view drift: every comparison
+    findings: Rows  # as the view drift_findings: changes, largest first
+    tests: Rows  # as the view drift: all comparisons
     periods: Rows  # robot, site, period, part, signal, recordings, episodes, p25, median, p75
     conditions: Rows  # robot, period, condition, driven_h, events, events_per_h
     notes: list[str]  # what could not be compared, and why
 
     @property
     def own(self) -> Rows:
-        """Return the comparisons of robots with their own references; only these find changes."""
+        """Return the comparisons of robots with their own reference; only these give findings."""
         return [row for row in self.tests if row["against"] == OWN]
 
     @property
     def tested(self) -> int:
-        """Return how many of them had enough data for a test."""
+        """Return how many comparisons of `own` had enough data for a test."""
         return sum(row["p"] is not None for row in self.own)
 
     def without_findings(self) -> str:
@@ -78,15 +78,15 @@ class Drift:
 def measure_drift(
     store: Store, *, every: str = "week", reference: int = 2, least_episodes: int = 5
 ) -> Drift:
-    """Compare each robot's periods with its own first ones and with the other robots.
+    """Compare each robot's periods with its own first periods, and with other robots.
 
     Args:
         every: the length of a period: day, week, month, year or decade.
-        reference: how many of a robot's first periods the later ones are compared with.
-        least_episodes: with fewer on a side the verdict is "too few".
+        reference: number of a robot's first periods with which its later periods are compared.
+        least_episodes: with fewer episodes on a side, the verdict is "too few".
 
     Raises:
-        ConfigError: no such period, or a number below its least.
+        ConfigError: an unknown period, or a number below its minimum.
     """
     if every not in PERIODS:
         raise ConfigError(
@@ -130,7 +130,7 @@ def measure_drift(
 
 
 def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
-    """Return what a reader must know of what was not, or hardly, compared."""
+    """Return notes for the reader on comparisons that lack data."""
     notes = []
     robots = sorted({row["robot"] for row in periods})
     if "untagged" in robots:

@@ -1,8 +1,8 @@
--- Every episode of a store as something that was logged once and could be logged again: what it met,
--- how long it took, and where. It takes parameters.
+-- Every episode of a store as a sample of what driving yields: its kind, duration, and rows by cell.
 
--- $kinds are the kinds of missions there are; an episode is of the one it met longest, by the truth
--- where the recording knew it, else by a label that held for $min_steps steps; else nominal.
+-- Parameter $kinds: kinds of missions. An episode's kind is the condition it met in the most steps. That
+-- is the true condition if the recording has it, else a label that held for at least $min_steps steps. An
+-- episode that met none is nominal.
 CREATE OR REPLACE TEMP TABLE yield_episodes AS
 WITH held AS (
     SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind, 1 AS least
@@ -46,7 +46,7 @@ LEFT JOIN met USING (episode_id);
 CREATE OR REPLACE TEMP TABLE yield_cells AS
 SELECT
     number,
-    -- All that hold, of which a cell names one.
+    -- All conditions that hold, separated by commas. A cell names one of them.
     coalesce(nullif(array_to_string(conditions, ','), ''), primary_condition, '') AS condition,
     coalesce(zone, '') AS zone,
     action,

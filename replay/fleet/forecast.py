@@ -1,9 +1,9 @@
-"""How many more missions (or hours) a gap takes, forecast at the rates seen so far.
+"""Forecast how many more missions (or hours) a gap needs, at the rates seen so far.
 
-Two things are unknown: the rate, of which there is a sample of episodes (a Bayesian bootstrap,
-Rubin 1981), and which of the coming missions will be rich ones (draws of episodes from it). Both
-are in the interval. Where many missions are needed, the second is the normal one of renewal theory.
-A kind of mission that never yielded a row has no rate: only a bound.
+Two things are uncertain: the rate, which is estimated from a sample of episodes (Bayesian
+bootstrap, Rubin 1981), and the yields of the coming missions (episodes drawn from that sample). The
+interval includes both. If many missions are needed, the second is approximated by renewal theory's
+normal distribution. A kind of mission that never yielded a row has no rate, only a bound.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ import numpy as np
 from restock.arrays import F64, Ints
 
 REPLICATES = 200
-_SIMULATED = 2000  # expected missions up to which they are drawn one by one
+_SIMULATED = 2000  # largest number of missions to draw one by one
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Of one kind of mission for one gap; amounts are missions or hours."""
+    """The forecast for one kind of mission and one gap; amounts are missions or hours."""
 
-    episodes: int  # that the rate is of
-    seen: int  # of them had any
-    rate: float  # rows (or episodes) for each
+    episodes: int  # episodes from which the rate is estimated
+    seen: int  # number of these with a yield above 0
+    rate: float  # rows (or episodes) per mission or hour
     rate_low: float  # 95 % interval
     rate_high: float
-    draws: F64  # (R,) amounts that were needed in replicates; empty where nothing was ever seen
+    draws: F64  # (R,) amounts needed in R replicates; empty if no episode had a yield
 
     @property
     def known(self) -> bool:
         return self.seen > 0
 
     def quantile(self, share: float) -> float:
-        """Return the amount that is enough in this share of the replicates; inf without draws."""
+        """Return the amount that suffices in this share of the replicates; inf without draws."""
         return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
 
 
@@ -48,9 +48,9 @@ def forecast(
     rng: np.random.Generator,
     replicates: int = REPLICATES,
 ) -> Forecast:
-    """Forecast from the yields of episodes (E,), each of so many missions or hours (E,).
+    """Forecast the amount for `missing` from the yields `found` (E,) and amounts (E,) of episodes.
 
-    Episodes of no length (of one step, say) count as none, and so do those without a yield (NaN).
+    Episodes with amount 0 (for example of one step) are ignored, and so are those with yield NaN.
     """
     used = (amount > 0) & ~np.isnan(found)
     found, amount = found[used], amount[used]
@@ -72,7 +72,7 @@ def forecast(
 def _needed(
     found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
 ) -> float:
-    """Return the amount after which `missing` is reached, in one replicate."""
+    """Simulate missions in one replicate; return the amount until `missing` is reached."""
     if missing <= 0:
         return 0.0
     mean = float(weights @ found)
@@ -91,10 +91,11 @@ def _needed(
 
 
 def missions_to_see_one(without: int) -> int:
-    """Return the missions that would show, with 95 %, what `without` missions did not, at best.
+    """Return how many more missions are needed, at least, to see one event with probability 95 %.
 
-    At best means at the highest rate that is still plausible: the exact (Clopper-Pearson) bound at
-    which `without` missions show none with 5 %. As many again then show one with 95 %.
+    `without` missions have shown none. The largest plausible rate is the exact (Clopper-Pearson)
+    bound, at which `without` missions show none with probability 5 %. At that rate, as many
+    missions again show one with probability 95 %.
     """
     return max(without, 1)
 
@@ -105,9 +106,9 @@ def probability_to_close(
     *,
     rng: np.random.Generator,
 ) -> float:
-    """Return the probability that planned missions yield what is missing.
+    """Return the probability that planned missions yield at least `missing`.
 
-    `parts` are pairs of yields (E,) and a number of missions.
+    `parts` are pairs: yields of past episodes (E,), and the number of planned missions.
     """
     total = np.zeros(REPLICATES)
     for sample, missions in parts:
@@ -127,17 +128,17 @@ def probability_to_close(
 
 
 def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
-    """Yield the weights of E episodes and one more, (E + 1,), in each replicate.
+    """Yield the weights (E + 1,) of E episodes and an additional one, for each replicate.
 
-    The additional one, of half a weight, yields nothing: even if each of a few episodes did, the
-    next may not.
+    The additional episode has half the weight and yield 0: even if every one of a few episodes had
+    a yield, the next may have none.
     """
     prior = np.append(np.ones(episodes), 0.5)
     return (rng.dirichlet(prior) for _ in range(count))
 
 
 def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
-    """Return so many drawn episodes, each with its weight (E,)."""
+    """Draw `size` episodes with replacement, in proportion to weights (E,)."""
     steps = np.cumsum(weights)
     drawn = np.searchsorted(steps, rng.random(size) * steps[-1], side="right")
     return np.asarray(np.minimum(drawn, len(weights) - 1), np.int64)

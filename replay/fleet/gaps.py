@@ -1,7 +1,7 @@
-"""Gaps of a store: rows that a mixture, the audits or a least number require, and that it lacks.
+"""Gaps of a store: rows that a mixture, an audit or a minimum requires, and that the store lacks.
 
-A gap is a number of rows (or episodes) of a cell of condition x zone x action x robot, with the
-contribution of each episode of the store: the sample for a forecast.
+A gap is a number of missing rows (or episodes) in a cell of condition x zone x action x robot. It
+has the rows that each episode of the store contributed: the sample for a forecast.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from restock.replay.store.audit import Thresholds, check_thresholds, shipped_aud
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
-MIN_STEPS = 3  # a label of a step or two may be a mistake
+MIN_STEPS = 3  # fewer steps with a label may be a mistake
 CELL = ("condition", "zone", "action", "robot")
 Unit = Literal["missions", "hours"]
 
@@ -44,16 +44,17 @@ class Yields:
 
     episode_id: list[str]  # (E,)
     hours: F64  # (E,)
-    kind: list[str]  # (E,) what it met, of the kinds of missions there are
-    simulated: bool  # the recordings knew the truth: missions of a kind can be driven
-    # Number (of the episode), condition (all that hold, by commas), zone, action, robot, rows.
+    kind: list[str]  # (E,) kind of mission by the condition it met, or nominal
+    simulated: bool  # some recordings have true conditions, so a simulator can drive a chosen kind
+    # Columns: number (of the episode), condition (all that hold, separated by commas), zone,
+    # action, robot, rows.
     cells: pa.Table
 
     def __len__(self) -> int:
         return len(self.episode_id)
 
     def members(self, kind: str | None = None, zone: str | None = None) -> Ints:
-        """Return the episodes of a kind, and those that came through a zone."""
+        """Return the episodes of a kind (None: any) that came through a zone (None: any)."""
         chosen = np.ones(len(self), np.bool_)
         if kind is not None:
             chosen &= np.array([one == kind for one in self.kind], np.bool_)
@@ -68,14 +69,14 @@ class Yields:
         return self.hours if zone is None else self._hours_in(zone)
 
     def rows_of(self, cell: dict[str, str | int]) -> F64:
-        """Return each episode's rows in a cell, (E,); fields that it does not name may be any."""
+        """Return each episode's rows in a cell, (E,); a field missing from the cell may be any."""
         kept = np.ones(len(self.cells), np.bool_)
         for name, value in cell.items():
             kept &= self._is(name, value)
         return self._sum(kept)
 
     def values(self, name: str) -> list[str | int]:
-        """Return what there is of condition, zone, action or robot."""
+        """Return the values that occur of condition, zone, action or robot, sorted."""
         values: list[str | int] = self.cells[name].unique().to_pylist()
         if name == "condition":
             values = [one for held in values for one in str(held).split(",")]
@@ -102,13 +103,13 @@ class Yields:
 
 
 def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
-    """Return the hours that episodes (E,) took; the last step takes as long as the others."""
+    """Return the durations of episodes (E,) in hours; the last step counts as long as others."""
     steps = np.maximum(rows - 1, 1)
     return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
 
 
 def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> Yields:
-    """Read the yield of each episode in `transitions`; `kinds` are the missions one could drive."""
+    """Read the yields of all episodes in `transitions`; `kinds` are the kinds of missions."""
     script = files("restock.replay.fleet").joinpath("episode_yields.sql")
     for statement in duckdb.extract_statements(script.read_text(encoding="utf-8")):
         given = {"kinds": list(kinds), "min_steps": MIN_STEPS}
@@ -125,30 +126,33 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
 
 
 def in_order(yields: Yields, names: pa.Array, found: F64) -> F64:
-    """Return what was found in the episodes of these ids, as `yields` has them (E,), or NaN."""
+    """Reorder values `found` of the episodes `names` to the order of `yields`, (E,); NaN if none.
+
+    `found` has one value per name.
+    """
     place = {name: index for index, name in enumerate(names.to_pylist())}
     padded = np.append(found, np.nan)
     return padded[[place.get(name, -1) for name in yields.episode_id]]
 
 
 Counted = Literal["rows", "episodes"]
-# Audits that ask for more of something, with their thresholds.
+# Audits whose thresholds give numbers of rows or episodes to reach.
 AUDITS = ("rare_condition", "few_effective_episodes", "missing_cells")
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Something that there is too little of."""
+    """A cell or stratum with too few rows or episodes."""
 
     asked_by: str  # "mixture coverage", "audit rare_condition", "--min-rows"
-    cell: dict[str, str | int]  # what it is of: condition (or stratum), zone, action, robot
+    cell: dict[str, str | int]  # any of condition (or stratum), zone, action, robot -> value
     counted: Counted
     needed: float
     there: float
-    # (E,) of each episode of the store, in rows or episodes; NaN where the mixture admits none.
+    # (E,) contribution of each episode, in rows or episodes; NaN if the mixture admits none of it.
     found: F64
-    action_name: str | None = None  # of the cell's action; None: it has none, or tasks differ
-    thinnest: tuple[str, ...] = ()  # the zones that are furthest below their part of what is needed
+    action_name: str | None = None  # name of the cell's action; None: no action, or tasks differ
+    thinnest: tuple[str, ...] = ()  # up to three zones furthest below their part of `needed`
 
     @property
     def missing(self) -> float:
@@ -166,17 +170,20 @@ def find_gaps(
     thresholds: Thresholds | None = None,
     min_rows: int = 0,
 ) -> tuple[Yields, list[Gap]]:
-    """Return the store's episodes, and what is missing, the most first.
+    """Return the store's episodes and its gaps: gaps in episodes first, then in rows, by size.
 
     Args:
-        name: of the mixture, for the reports; `folder`: where its other stores are looked up.
-        kinds: of missions that can be driven: names of conditions, the store's or shipped ones.
-        thresholds: of audits, by audit; those of AUDITS are asked. None: the mixture alone.
-        min_rows: that each cell of CELL should have; 0: not asked.
+        store: the store.
+        mixture: the mixture whose shares should be filled.
+        name: the mixture's name, for reports.
+        folder: the folder for relative paths of the mixture's other stores.
+        kinds: kinds of missions that can be driven: conditions of the store, or shipped ones.
+        thresholds: audit -> its thresholds; AUDITS are used. None: the mixture alone.
+        min_rows: minimum of rows in each cell of CELL; 0: none.
 
     Raises:
-        ConfigError, MixtureError, StoreError: as `plan_panel` does; kinds, audits and thresholds
-            that there are not, or thresholds of another kind.
+        ConfigError, MixtureError, StoreError: see `plan_panel`; also unknown kinds, audits or
+            thresholds, or a threshold of a wrong type.
     """
     _refuse_unknown(kinds, [NOMINAL, *(one.name for one in store.conditions()), *shipped()])
     if thresholds is not None:
@@ -214,9 +221,9 @@ def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
 
 
 def uncorrected(mixture: Mixture) -> Mixture:
-    """Return the mixture without weights, which take long to estimate and require no rows.
+    """Return the mixture without weights, which are slow to estimate and do not affect gaps.
 
-    The search is for shortfalls, so they are not refused.
+    The result accepts shortfalls, because they are what is searched.
     """
     strata = tuple(msgspec.structs.replace(rule, correction=None) for rule in mixture.strata)
     each = mixture.each_condition
@@ -230,7 +237,7 @@ def uncorrected(mixture: Mixture) -> Mixture:
 
 
 def _without_split(store: Store, mixture: Mixture) -> Mixture:
-    """Return the mixture, which keeps no recording from a store of one."""
+    """Return the mixture; without a split by recording if the store has only one recording."""
     if mixture.evaluation_split.by != "recording":
         return mixture
     several = store.sql("SELECT count(DISTINCT recording_id) > 1 FROM transitions").fetchall()[0][0]
@@ -239,7 +246,7 @@ def _without_split(store: Store, mixture: Mixture) -> Mixture:
 
 
 def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
-    """Find strata with too few rows for the share that the mixture wants."""
+    """Return a gap for each stratum with too few rows for its wanted share."""
     gaps = []
     names = plan.rows["episode_id"].combine_chunks().dictionary
     for code, line in enumerate(plan.strata):
@@ -254,7 +261,10 @@ def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
 
 
 def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
-    """Rank zones by how far their rows of a stratum fall below their part of all driving."""
+    """Return up to three zones whose rows in a stratum are furthest below their share of driving.
+
+    A zone's part of `needed` is its share of all rows.
+    """
     column = plan.rows["zone"].combine_chunks()
     names, zone = column.dictionary.to_pylist(), column.indices.fill_null(len(column.dictionary))
     size = len(names) + 1
@@ -267,14 +277,14 @@ def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
 def _of_audits(
     connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
 ) -> list[Gap]:
-    """Return what the shipped audits of coverage ask for."""
+    """Return the gaps by the thresholds of AUDITS, including closed ones."""
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(
         "SELECT condition, rows_held, episodes_held, effective_episodes FROM coverage_by_condition"
     ).fetchall()
     for condition, rows, episodes, effective in lines:
-        if rows is None:  # unknown of every recording: no drive of these robots brings any
+        if rows is None:  # unknown in all recordings: more drives would not add any
             continue
         found = yields.rows_of({"condition": condition})
         observed = np.asarray(found > 0, np.float64)
@@ -285,7 +295,7 @@ def _of_audits(
         gaps.append(Gap(by, cell, "episodes", requested.get("min_episodes", 0), episodes, observed))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
         if effective and effective < least:  # 0: it holds in no row
-            # As many more as would do if they were as uneven as those that there are.
+            # Assumes that further episodes are as uneven as those in the store.
             needed = math.ceil(least * episodes / effective)
             by = "audit few_effective_episodes"
             gaps.append(Gap(by, cell, "episodes", needed, episodes, observed))
@@ -299,15 +309,15 @@ def _of_audits(
 
 
 def _of_cells(yields: Yields, conditions: Sequence[Condition], min_rows: int) -> list[Gap]:
-    """Find cells with fewer rows, empty ones included.
+    """Return a gap for each cell with fewer than `min_rows` rows, including empty ones.
 
-    A cell of a robot counts that robot's rows, and is forecast by what any robot meets.
+    A robot's cell counts only that robot's rows, but is forecast from the rows of all robots.
     """
     gaps = []
     values: dict[str, list[str | int]] = {name: yields.values(name) for name in CELL}
     known = {NOMINAL, *(condition.name for condition in conditions), *values["condition"]}
     values["condition"] = sorted(known, key=str)
-    if values["robot"] == [""]:  # no recording says which robot
+    if values["robot"] == [""]:  # no recording has the tag
         del values["robot"]
     for chosen in product(*values.values()):
         cell: dict[str, Any] = dict(zip(values, chosen, strict=True))

@@ -1,10 +1,10 @@
 """A missions file: which missions to drive next, as TOML for people and for `restock twin record`.
 
 [[missions]]
-kind = "wheel_slip"      # what it is to meet
-missions = 14            # how many; or `hours` of logging, where missions cannot be chosen
-zone = "aisle_2_east"    # that it comes through; left out: anywhere
-layout = "default"       # the floor; left out: any of those that are driven on
+kind = "wheel_slip"      # condition that the missions should meet
+missions = 14            # number of missions; or `hours` of logging, if missions cannot be chosen
+zone = "aisle_2_east"    # zone on their route; if left out, any
+layout = "default"       # floor; if left out, any floor in use
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _REMEDY = "docs/coverage.md lists the keys of a missions file"
 
 
 class MissionOrder(Checked, frozen=True, kw_only=True):
-    """So many missions of one kind, or so many hours of logging."""
+    """A number of missions of one kind, or hours of logging."""
 
     kind: str | None = None  # condition that a mission should meet; None: any
     missions: Annotated[int, Meta(ge=1)] | None = None
-    hours: Annotated[float, Meta(gt=0)] | None = None  # of driving; with `missions`: their duration
+    hours: Annotated[float, Meta(gt=0)] | None = None  # of driving; their duration, if `missions`
     zone: str | None = None
     robot: str | None = None
     layout: str | None = None
@@ -43,7 +43,7 @@ class MissionOrder(Checked, frozen=True, kw_only=True):
 
 
 class MissionsFile(Checked, frozen=True, kw_only=True):
-    """What to drive, and what it was worked out from."""
+    """The contents of a missions file: orders, and the store and mixture they are planned for."""
 
     missions: tuple[MissionOrder, ...]
     format: str = FORMAT
@@ -61,7 +61,7 @@ def read_missions(path: str | Path) -> MissionsFile:
     """Read a missions file.
 
     Raises:
-        ConfigError: it cannot be read, an unknown key, or a value that does not fit.
+        ConfigError: the file cannot be read, or has an unknown key or an invalid value.
     """
     remedy = "`restock coverage gaps STORE --missions-out FILE` writes one"
     document = read_toml(Path(path), remedy=remedy)
@@ -69,10 +69,10 @@ def read_missions(path: str | Path) -> MissionsFile:
 
 
 def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
-    """Return the plan of a shopping list for `store`, named as STORE@VERSION.
+    """Convert a shopping list to a missions file; `store` is STORE@VERSION.
 
     Raises:
-        ConfigError: it plans nothing: there are no gaps, or none that anything seen so far fills.
+        ConfigError: the list has no orders: there are no gaps, or no gap has a known rate.
     """
     if not found.orders:
         raise ConfigError(
@@ -96,7 +96,7 @@ def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise ConfigError where there is something already."""
+    """Raise ConfigError if the path exists."""
     if path.exists():
         raise ConfigError(
             "already there", where=str(path), remedy="choose another name, or remove it"
@@ -104,7 +104,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def write_missions(path: Path, missions: MissionsFile) -> None:
-    """Write a missions file in one step. Raises ConfigError where it cannot be written."""
+    """Write a missions file atomically. Raises ConfigError if it cannot be written."""
     try:
         write_text(path, as_toml(missions))
     except OSError as error:
@@ -112,7 +112,7 @@ def write_missions(path: Path, missions: MissionsFile) -> None:
 
 
 def as_toml(missions: MissionsFile) -> str:
-    """Return the text of the file."""
+    """Return the TOML text of a missions file."""
     driven = any(order.missions is not None for order in missions.missions)
     how = "`restock twin record --missions` drives it" if driven else "the twin cannot drive hours"
     lines = [

@@ -1,4 +1,4 @@
-"""Two panels: mixture, rows, shares and weights side by side."""
+"""Compare two panels: mixture, rows, shares and weights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from restock.errors import PanelError, expect
 from restock.replay.panel.panel import Panel
 
 Rows = list[dict[str, Any]]
-# What a header says that is no content of its own, or is compared elsewhere.
+# Header fields that are compared separately, or follow from other content.
 _ELSEWHERE = ("id", "files", "strata", "mixture", "task_json", "task_hash")
 SHARES = ("natural_share", "wanted_share", "share", "effective_share")
 
@@ -64,7 +64,7 @@ def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, Any]]:
         for key, item in value.items():
             yield from _flat(item, f"{prefix}.{key}" if prefix else str(key))
     elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
-        # A list of tables: each by its name, so that one more does not shift the others.
+        # A list of tables: keyed by name, so that an added table does not shift the others.
         for place, item in enumerate(value):
             name = item.get("name", place) if isinstance(item, Mapping) else place
             yield from _flat(item, f"{prefix}[{name}]")

@@ -1,7 +1,8 @@
 """The shopping list: which missions, and how many of each, fill the gaps of a store.
 
-Each gap is forecast for each kind of mission; the least number of missions that fills all of them
-is an integer linear programme. The planned amount is enough with a stated probability, gap by gap.
+For each gap and kind of mission there is a forecast. An integer linear programme finds the smallest
+number of missions that fills all gaps. For each gap by itself, the planned amount suffices with the
+probability CONFIDENCE.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.store.audit import load_thresholds
 from restock.replay.store.store import Store
 
-# Of `FROM gaps(name)`, with their types.
+# Columns of `FROM gaps(name)` -> their types.
 COLUMNS = {
     **dict.fromkeys(("asked_by", "stratum", "condition", "zone"), "VARCHAR"),
     "action": "BIGINT",
@@ -40,18 +41,18 @@ COLUMNS = {
     **dict.fromkeys(("rate", "rate_low", "rate_high"), "DOUBLE"),
     **dict.fromkeys(("amount", "amount_low", "amount_high"), "DOUBLE"),
 }
-CONFIDENCE = 0.8  # with which the planned amount is to close each gap by itself
-HOUR_STEPS = 60  # of an hour that is planned
-_PART = 0.1  # of a gap that an order fills at least, to be named as for it
+CONFIDENCE = 0.8  # probability with which the planned amount should close each gap by itself
+HOUR_STEPS = 60  # planned hours are rounded up to multiples of 1 / HOUR_STEPS
+_PART = 0.1  # smallest fraction of a gap that an order fills to be listed for it
 
 
 @dataclass(frozen=True)
 class Supply:
-    """A kind of mission, or of an hour of logging, that could be ordered."""
+    """A kind of mission, or of logging by the hour, that could be ordered."""
 
-    kind: str | None  # None: whatever the fleet does
-    zone: str | None = None  # that it comes through
-    robot: str | None = None  # that drives it
+    kind: str | None  # None: the fleet's usual operation
+    zone: str | None = None  # zone on the route; None: any
+    robot: str | None = None  # robot that drives; None: any
 
     @property
     def name(self) -> str:
@@ -63,13 +64,13 @@ class Supply:
 
 @dataclass(frozen=True)
 class FilledGap:
-    """A gap with what would fill it."""
+    """A gap with the supply that fills it best."""
 
     gap: Gap
-    best: Supply | None  # None: nothing that was ever logged had any
-    forecast: Forecast | None  # of the best
-    see_one: tuple[Supply, int] | None  # where nothing had any: what would show one, at best
-    closes_with: float | None = None  # the probability that the plan closes it
+    best: Supply | None  # None: no logged episode contributed to it
+    forecast: Forecast | None  # forecast of the best supply
+    see_one: tuple[Supply, int] | None  # without `best`: supply, and missions to see one at least
+    closes_with: float | None = None  # probability that the plan closes it
 
 
 @dataclass(frozen=True)
@@ -79,18 +80,18 @@ class Order:
     supply: Supply
     amount: float  # missions, or hours
     hours: float
-    fills: tuple[str, ...]  # the gaps that it is for
+    fills: tuple[str, ...]  # the gaps to which it contributes
 
 
 @dataclass(frozen=True)
 class ShoppingList:
-    """What to log next."""
+    """A plan of what to log next."""
 
     unit: Unit
     gaps: list[FilledGap]
     orders: list[Order]
-    total_low: float  # of all orders together: 95 % of replicates need more than this …
-    total_high: float  # … and less than this
+    total_low: float  # total amount at the 2.5 % quantile of each gap's replicates
+    total_high: float  # total amount at the 97.5 % quantile
 
     @property
     def total(self) -> float:
@@ -103,11 +104,13 @@ def shopping_list(
     *,
     unit: Unit | None = None,
 ) -> ShoppingList:
-    """Return what fills the gaps, at the rates of the store's episodes.
+    """Plan what fills the gaps, at the rates of the store's episodes.
 
     Args:
-        unit: missions of a kind, or hours of logging; None: missions where the recordings knew the
-            truth (a simulator drives what one orders), else hours.
+        yields: the store's episodes.
+        gaps: the gaps of `find_gaps`.
+        unit: missions of a kind, or hours of logging; None: missions if recordings have true
+            conditions (a simulator drives any kind ordered), else hours.
     """
     if unit is None:
         unit = "missions" if yields.simulated else "hours"
@@ -120,7 +123,7 @@ def shopping_list(
         amount = yields.amount(unit, supply.zone)[at]
         for index, gap in enumerate(gaps):
             if _may_fill(supply, gap):
-                # The same draws for every gap: gaps that are alike come out alike.
+                # The same draws for every gap, so that equal gaps get equal forecasts.
                 draws = np.random.default_rng(0)
                 table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
     filled = [
@@ -142,13 +145,13 @@ def shopping_list(
 
 
 def _may_fill(supply: Supply, gap: Gap) -> bool:
-    """Return whether it is of the zone and the robot that the gap names."""
+    """Return whether the supply has the zone and the robot that the gap requires, if any."""
     requested = ((gap.cell.get("zone"), supply.zone), (gap.cell.get("robot"), supply.robot))
     return all(wanted is None or wanted in ("", given) for wanted, given in requested)
 
 
 def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
-    """Return what fills a gap best: a cell of a zone is filled by missions that come through it."""
+    """Return the supplies for a gap, one per kind, with the gap's zone and robot."""
     zone, robot = gap.cell.get("zone"), gap.cell.get("robot")
     return [
         Supply(kind, None if zone is None else str(zone), str(robot) if robot else None)
@@ -161,7 +164,7 @@ def _filled(gap: Gap, mine: dict[Supply, Forecast]) -> FilledGap:
     if known:
         best = min(known, key=lambda supply: known[supply].quantile(CONFIDENCE))
         return FilledGap(gap, best, known[best], None)
-    # The kind of mission that is called so, else the one that was driven least: it has shown least.
+    # Choose the kind named like the gap, else the kind with the fewest episodes so far.
     named = [
         supply
         for supply in mine
@@ -178,11 +181,10 @@ def _least(
     share: float,
     unit: Unit,
 ) -> dict[Supply, float]:
-    """Compute the smallest amounts that fill all gaps that can be filled.
+    """Compute the smallest amounts that fill all reachable gaps.
 
-    An amount is enough for a gap if it fills that gap in a share `share` of the replicates.
-
-    A mission counts for a gap by what it takes of it alone: missing / the amount that is enough.
+    An amount suffices for a gap if it fills the gap in a fraction `share` of the replicates. One
+    mission counts as missing / amount that suffices, for each gap.
     """
     from scipy.optimize import LinearConstraint, milp
 
@@ -197,8 +199,8 @@ def _least(
                 rates[row, column] = gaps[index].missing / max(*enough, 1e-9)
     whole = unit == "missions"
     missing = np.array([gaps[index].missing for index in reachable])
-    scale = np.maximum(missing, 1e-9)  # gaps of ten rows and of ten thousand in one programme
-    # Where either would do, a mission that may be anywhere is easier to have.
+    scale = np.maximum(missing, 1e-9)  # for gaps of ten rows and of ten thousand in one programme
+    # On a tie, prefer missions without a required zone or robot, which are easier to arrange.
     cost = [1.001 if supply.zone or supply.robot else 1.0 for supply in supplies]
     found = milp(
         np.array(cost),
@@ -206,7 +208,7 @@ def _least(
         integrality=np.full(len(supplies), int(whole)),
         options={"time_limit": 10.0, "mip_rel_gap": 0.01},
     )
-    if found.x is None:  # cannot be: each gap has a kind that fills it
+    if found.x is None:  # should not happen: each gap has a kind that fills it
         return {}
     amounts = np.round(found.x) if whole else np.ceil(found.x * HOUR_STEPS - 1e-6) / HOUR_STEPS
     return {s: float(a) for s, a in zip(supplies, amounts.tolist(), strict=True) if a > 0}
@@ -215,10 +217,10 @@ def _least(
 def _forecasts(
     table: dict[tuple[int, Supply], Forecast], index: int, supply: Supply
 ) -> list[Forecast]:
-    """Return what is known of a supply for a gap; the worst of it counts.
+    """Return the forecasts of a supply for a gap, with and without its zone and robot.
 
-    Of many zones the luckiest one looks best. So if the gap is in any zone, missions through one
-    zone count no more than missions through all.
+    The caller uses the worst. Of many zones, the one with the luckiest sample looks best. So if a
+    gap has no zone, missions through one zone count no more than missions anywhere.
     """
     ways = (supply, Supply(supply.kind, None, supply.robot), Supply(supply.kind))
     return [one for way in dict.fromkeys(ways) if (one := table.get((index, way))) is not None]
@@ -256,7 +258,7 @@ def _with_probability(
 
 
 def describe_cell(gap: Gap) -> str:
-    """Name a cell: `wheel_slip`, or `wheel_slip, turn left 1.2, aisle_2`."""
+    """Describe a cell in words: `wheel_slip`, or `wheel_slip, turn left 1.2, aisle_2`."""
     cell = dict(gap.cell)
     words = [str(cell.pop(name)) for name in ("stratum", "condition") if name in cell]
     if (action := cell.pop("action", None)) is not None:
@@ -265,7 +267,7 @@ def describe_cell(gap: Gap) -> str:
 
 
 def document(found: ShoppingList) -> dict[str, Any]:
-    """Return plain values, as `restock coverage gaps --json` prints them."""
+    """Return a shopping list as the plain values that `restock coverage gaps --json` prints."""
     return {
         "unit": found.unit,
         "confidence": CONFIDENCE,
@@ -325,7 +327,7 @@ Lines = list[dict[str, Any]]
 
 
 def readable(answer: dict[str, Any]) -> tuple[Lines, Lines, Lines]:
-    """Return a `document` as lines of tables: gaps with a rate, those without, and the plan."""
+    """Return a `document` as rows of three tables: gaps with a rate, gaps without, and the plan."""
     unit = answer["unit"]
     known = [
         {
@@ -341,7 +343,7 @@ def readable(answer: dict[str, Any]) -> tuple[Lines, Lines, Lines]:
         for gap in answer["gaps"]
         if gap["best"]
     ]
-    # In one line the actions that nobody ever took in a condition.
+    # Actions never taken in a condition share one row.
     groups: dict[tuple[Any, ...], Lines] = {}
     for gap in answer["gaps"]:
         if not gap["best"]:
@@ -384,16 +386,16 @@ def _with_ends(gap: dict[str, Any], name: str) -> str:
 
 
 def _without_empty(lines: Lines) -> Lines:
-    """Leave out the columns that say nothing in any line."""
+    """Leave out columns that are empty in all rows."""
     kept = {name for line in lines for name, value in line.items() if value != ""}
     return [{name: value for name, value in line.items() if name in kept} for line in lines]
 
 
 def install_gaps(store: Store) -> None:
-    """Make `gaps(name)` in a store's connection: what a mixture and the audits find missing.
+    """Create the macro `gaps(name)` in a store's connection: gaps by a mixture and the audits.
 
-    Missions are of the kinds that the store's conditions name; `restock coverage gaps` takes those
-    that the twin can drive.
+    Kinds of missions are the store's conditions. (`restock coverage gaps` uses those that the twin
+    can drive.)
     """
     script = files("restock.replay.fleet") / "gaps.sql"
     install_planned(store, ("gaps",), {"planned_gaps": (COLUMNS, _gaps_table)}, script, _list_of)
@@ -412,6 +414,6 @@ def _list_of(own: Store, name: str) -> ShoppingList:
 
 
 def _gaps_table(found: ShoppingList) -> pa.Table:
-    """Return a row a gap, columns COLUMNS."""
+    """Return one row per gap, with columns COLUMNS."""
     lines = [{**line, "unit": found.unit} for line in document(found)["gaps"]]
     return pa.table({name: [line[name] for line in lines] for name in COLUMNS})

@@ -1,7 +1,7 @@
 """Differences of two stores, or two versions of one: what was added, removed and changed.
 
-Episodes are matched by recording and first stamp, whatever ingest wrote them; rows by id. What is
-compared is SQL (`between.sql`). Whether a change is more than chance, `measure_drift` tests.
+Episodes are matched by recording and first stamp, even if other ingests wrote them; rows by id. The
+comparison is in SQL (`between.sql`). `measure_drift` tests whether a change is more than chance.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from restock.process import interrupts_raised
 from restock.replay.store.query import rows_of
 from restock.replay.store.store import Store
 
-# Columns of `transitions` whose values' shares are compared, as far as both stores have them.
+# Columns of `transitions` whose shares of values are compared, if both stores have them.
 SHARES_OF = ("primary_condition", "zone", "behaviour_policy", "robot", "site", "shift")
 
 
@@ -74,7 +74,7 @@ def _difference(
     (of_episodes,) = rows_of(connection, "FROM episode_counts")
     return {
         "kind": "store",
-        # Anything but the version.
+        # A new version alone is not a difference.
         "different": bool(
             definitions or recordings or labels or of_rows["rows_with_other_changes"]
         ),
@@ -101,7 +101,7 @@ def _side(connection: duckdb.DuckDBPyConnection, store: Store, name: str) -> dic
 
 
 def _share_values(connection: duckdb.DuckDBPyConnection) -> str:
-    """Return the query for each row's values of the columns SHARES_OF that both stores have."""
+    """Return a query for each row's values in the columns of SHARES_OF that both stores have."""
     has = [set(connection.sql(f"FROM {side}.transitions LIMIT 0").columns) for side in "ab"]
     return " UNION ALL ".join(
         f"SELECT {place} AS place, '{column}' AS \"of\", '{side}' AS side,"
