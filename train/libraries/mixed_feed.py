@@ -46,7 +46,7 @@ from restock.train.run.run_tables import TABLES
 SB3 = "stable-baselines3"
 PROFILE = "warehouse_amr"
 _NO_ROWS: Ints = np.empty(0, np.int64)
-_GO_ON = (
+_TAKEN_REMEDY = (
     "choose another `run`; to go on in this one, load the replay buffer that was saved with it"
     " (model.load_replay_buffer)"
 )
@@ -103,10 +103,10 @@ class MixedFeed:
             raise ConfigError(f"logs_share must be in [0, 1], got {share:g}")
         profile = environment_profile(options.profile, panel)
         if panel is not None:
-            _check(panel, profile, observation_size)
+            _check_panel(panel, profile, observation_size)
         self.logs = Logs.of_panel(panel, as_of_ns=now_ns()) if panel is not None else None
         self.rng = np.random.default_rng([options.seed, 1])
-        self.labels = labels_of(profile, panel, num_envs)
+        self.labels = make_labeller(profile, panel, num_envs)
         self.env_steps = self.batches = self.invalid_steps = 0
         self.episode_labels = EpisodeLabels()
         self._sampler: LoggedSampler | None = None
@@ -343,7 +343,7 @@ def environment_profile(name: str | None, panel: Panel | None) -> Profile | None
     return load_profile(name or PROFILE)
 
 
-def labels_of(profile: Profile | None, panel: Panel | None, num_envs: int) -> FreshLabels:
+def make_labeller(profile: Profile | None, panel: Panel | None, num_envs: int) -> FreshLabels:
     """Make the labeller of fresh episodes: by the profile's conditions, or by infos without one."""
     if profile is None:
         names = panel.header.conditions if panel is not None else [NOMINAL]
@@ -352,7 +352,7 @@ def labels_of(profile: Profile | None, panel: Panel | None, num_envs: int) -> Fr
     return FreshLabels(conditions_in_twin(profile.conditions, signals, lidar=lidar)[0], num_envs)
 
 
-def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None:
+def _check_panel(panel: Panel, profile: Profile | None, observation_size: int) -> None:
     if profile is None:
         if panel.observation_size != observation_size:
             raise PanelError(
@@ -374,7 +374,7 @@ def _check(panel: Panel, profile: Profile | None, observation_size: int) -> None
 
 
 # Columns of `episodes` that the info of an episode's last step has under the same name.
-_INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
+_INFO_COLUMNS = ("episode_seed", "perturbation", "block", "success", "bumps")
 
 
 def _create_run(
@@ -385,7 +385,7 @@ def _create_run(
     options: FeedOptions,
 ) -> Run:
     """Make the run and write its `config.json`; raise RunError if something is at `path`."""
-    check_free(path, _GO_ON)
+    check_free(path, _TAKEN_REMEDY)
     mixed = None
     if panel is not None:
         strata = {stratum.name: stratum.share for stratum in panel.strata}
@@ -448,23 +448,23 @@ def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
     """Return a row of `episodes`, with the columns that the last step's info has."""
     columns = set(TABLES["episodes"].names)
     row = {"env": env, "episode": key, "conditions": []}
-    row |= {name: _plain(info[name]) for name in _INFO if name in info}
+    row |= {name: _plain_value(info[name]) for name in _INFO_COLUMNS if name in info}
     if "episode_condition" in info:
-        row["true_condition"] = _plain(info["episode_condition"])
+        row["true_condition"] = _plain_value(info["episode_condition"])
     if "perturbation_values" in info:
-        row["perturbation_values"] = values_entries(str(_plain(info["perturbation_values"])))
+        row["perturbation_values"] = values_entries(str(_plain_value(info["perturbation_values"])))
     if "episode_steps" in info:
-        row["steps"] = _plain(info["episode_steps"])
+        row["steps"] = _plain_value(info["episode_steps"])
     return {name: value for name, value in row.items() if name in columns}
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
 EPISODES_PER_QUERY = 8  # at most; fewer if there are fewer environments
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
-_NAMES = tuple(signal.name for signal in STORED_SIGNALS)
+_SIGNAL_NAMES = tuple(signal.name for signal in STORED_SIGNALS)
 
 
 @dataclass(frozen=True)
@@ -505,18 +505,18 @@ class FreshLabels:
         Returns False if the episode has ended and cannot be labelled, else True.
         """
         steps = self._running[env]
-        steps.append(self._known(info))
+        steps.append(self._step_facts(info))
         if not ended:
             return True
         self._running[env] = []
         if any(step is None for step in steps):
             return False
         if self.conditions is not None:
-            steps.append({name: info["signals"][name] for name in _NAMES})
+            steps.append({name: info["signals"][name] for name in _SIGNAL_NAMES})
         self._ended.append((key, steps))
         return True
 
-    def _known(self, info: Mapping[str, Any]) -> Any:
+    def _step_facts(self, info: Mapping[str, Any]) -> Any:
         """Return the signals of a step with its command, or its condition; None if unknown."""
         if self.conditions is None:
             name = info.get("condition")
@@ -524,7 +524,7 @@ class FreshLabels:
         before, after = info.get("signals_before"), info.get("signals")
         if before is None or after is None:
             return None
-        row = {name: before[name] for name in _NAMES}
+        row = {name: before[name] for name in _SIGNAL_NAMES}
         return row | {name: after[name] for name in _COMMANDS}
 
     def forget(self) -> None:

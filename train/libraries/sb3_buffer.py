@@ -104,7 +104,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         """Return the feed; its first use opens the panel and makes the run."""
         panel = self._panel
         panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
-        if panel is not None and not self._ignore_weights and weighted(panel):
+        if panel is not None and not self._ignore_weights and is_weighted(panel):
             raise MixtureError(
                 "its rows have importance weights, but the losses of Stable-Baselines3 do not use "
                 "any",
@@ -259,7 +259,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self._steps[:] = 0
 
 
-def weighted(panel: Panel) -> bool:
+def is_weighted(panel: Panel) -> bool:
     """Return whether a panel's rows have importance weights, by a correction or a draw rule."""
     by_rule = any(RULES[stratum.within].has_weights for stratum in panel.strata)
     return by_rule or any(stratum.correction != "none" for stratum in panel.strata)

@@ -72,7 +72,7 @@ class TensorBoard:
 
 
 @dataclass
-class _Count:
+class _Failures:
     """The number of a sink's failed calls, and the first error."""
 
     failed: int = 0
@@ -97,7 +97,7 @@ class Events:
     ) -> None:
         self._run, self._say = run, say or _to_stderr
         self._open: list[Sink] = []
-        self.failures: dict[str, _Count] = {name: _Count() for name in sinks or {}}
+        self.failures: dict[str, _Failures] = {name: _Failures() for name in sinks or {}}
         for name, opens in (sinks or {}).items():
             self._try(name, lambda opens=opens: self._open.append(opens()))  # type: ignore[misc]
         self._write()

@@ -35,7 +35,7 @@ from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
 LIMITED = "limited:"  # prefix of a policy whose commands pass the limiter
-_NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
+_KEY_COLUMNS = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
 
 def read_evaluations(run: Path) -> pa.Table:
@@ -61,8 +61,8 @@ def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
     Time lost is computed for all episodes, against the planner's last drive of the same mission.
     Returns the added rows with their time lost.
     """
-    earlier, new = read_evaluations(run), set(_names(driven))
-    kept = [name not in new for name in _names(earlier)]
+    earlier, new = read_evaluations(run), set(_episode_keys(driven))
+    kept = [name not in new for name in _episode_keys(earlier)]
     whole = pa.concat_tables([earlier.filter(pa.array(kept, pa.bool_())), driven])
     rows = whole.to_pylist()
     planner_s = planner_times(rows)
@@ -110,13 +110,14 @@ def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
     newest = dict(zip(policies, versions, strict=True))
     version = newest.get("agent")
     mask = [
-        on == last["layouts"] and (not _changes(policy) or of == newest[policy])
-        for policy, of, on in zip(policies, versions, layouts, strict=True)
+        driven == last["layouts"] and (not _has_versions(policy) or made == newest[policy])
+        for policy, made, driven in zip(policies, versions, layouts, strict=True)
     ]
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
     text = f"{shown.num_rows:,} of {table.num_rows:,} episodes that `restock eval` drove: "
-    text += f"floors {_floors(last['layouts'] or 'not named')}, policy {version or 'not named'}"
+    floors = _floor_names(last["layouts"] or "not named")
+    text += f"floors {floors}, policy {version or 'not named'}"
     if (step := trained_step(shown)) is not None:
         text += f" of step {step:,}"
     return shown, text + f", seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
@@ -129,20 +130,20 @@ def trained_step(shown: pa.Table) -> int | None:
     return step
 
 
-def _floors(layouts: str) -> str:
+def _floor_names(layouts: str) -> str:
     """Shorten a list of floors: file names without folders; of more than 3 the first and last."""
     names = [part.rpartition("/")[2].strip() for part in layouts.split(",")]
     some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
     return ", ".join(some)
 
 
-def _changes(policy: str) -> bool:
+def _has_versions(policy: str) -> bool:
     """Return whether a policy of this name changes with the run or with the limiter's settings."""
     return policy == "agent" or policy.startswith(LIMITED)
 
 
-def _names(table: pa.Table) -> list[tuple[str, ...]]:
-    columns = [list(map(str, table[name].to_pylist())) for name in _NAME]
+def _episode_keys(table: pa.Table) -> list[tuple[str, ...]]:
+    columns = [list(map(str, table[name].to_pylist())) for name in _KEY_COLUMNS]
     return list(zip(*columns, map(str, table["episode_seed"].to_pylist()), strict=True))
 
 
@@ -184,20 +185,20 @@ class CloneQuality:
     @property
     def text(self) -> str:
         """Describe the clone and its quality in a sentence or two."""
-        said = (
+        description = (
             f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
             f" ({counted(self.rows, 'row')} of"
             f" {counted(self.episodes, 'episode')})"
         )
         if self.agreement is not None:
-            said += (
+            description += (
                 f"; in {self.held_out_rows:,} held-out rows the drivers' action is its likeliest "
                 f"in {self.agreement:.0%} (repeating the last one: {self.repeating:.0%}"
             )
             if self.changed_agreement is not None:
-                said += f"; where they changed it: {self.changed_agreement:.0%}"
-            said += ")"
-        return ". ".join(part for part in (said, self.poor, self.note) if part)
+                description += f"; where they changed it: {self.changed_agreement:.0%}"
+            description += ")"
+        return ". ".join(part for part in (description, self.poor, self.note) if part)
 
 
 def read_clones(run: Path) -> list[CloneQuality]:
@@ -228,14 +229,14 @@ def summary_rows(episodes: Iterable[Row]) -> list[dict[str, Any]]:
 
     Blocked aisles are split into partial and full.
     """
-    cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    groups: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in episodes:
-        of = cells.setdefault((row["policy"], row["perturbation"]), {})
-        of.setdefault(cell_name(row["condition"], row["block"]), []).append(row)
+        group = groups.setdefault((row["policy"], row["perturbation"]), {})
+        group.setdefault(cell_name(row["condition"], row["block"]), []).append(row)
     return [
-        {"policy": policy, "perturbation": perturbation, "condition": cell, **measures(of[cell])}
-        for (policy, perturbation), of in cells.items()
-        for cell in sorted(of, key=lambda cell: (cell != "nominal", cell))
+        {"policy": policy, "perturbation": perturbation, "condition": cell, **measures(group[cell])}
+        for (policy, perturbation), group in groups.items()
+        for cell in sorted(group, key=lambda cell: (cell != "nominal", cell))
     ]
 
 
@@ -268,7 +269,7 @@ def measures(episodes: Sequence[Row]) -> dict[str, Any]:
         "closest_person_least_m": min(near, default=None),
         **_mean("closest_person_m", near),
         "time_s": float(np.mean(arrived)) if arrived else None,
-        **_limited(episodes),
+        **_limited_shares(episodes),
         "time_lost_episodes": len(lost),
         **_mean("time_lost_s", lost),
     }
@@ -296,7 +297,7 @@ def measured_row(row: Row) -> dict[str, Any]:
     }
 
 
-def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
+def _limited_shares(episodes: Sequence[Row]) -> dict[str, float | None]:
     """Return the shares of driven time in which a limiter reduced commands, and stopped them."""
     behind = [row for row in episodes if row.get("limited_s") is not None]
     time_s = sum(row["time_s"] for row in behind)
@@ -328,6 +329,6 @@ def _mean(name: str, values: Iterable[float]) -> dict[str, float | None]:
     return _interval(name, mean_over_strata([known], rng=np.random.default_rng(0)))
 
 
-def _interval(name: str, of: ConfidenceInterval) -> dict[str, float | None]:
-    values = {name: of.value, f"{name}_low": of.low, f"{name}_high": of.high}
+def _interval(name: str, interval: ConfidenceInterval) -> dict[str, float | None]:
+    values = {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return {key: None if np.isnan(value) else value for key, value in values.items()}

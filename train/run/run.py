@@ -48,7 +48,7 @@ MEAN_OF = "mean_of"  # key of config.json: policies whose mean this untrained ru
 _EARLIER = ("restock-run/1", "restock-run/2")
 _LONG_TABLE = 4096  # rows
 _UNKNOWN = -1  # number of rows on disk, if they differ from memory: the next flush writes them
-_AGAIN = "restore the file from a copy, or train the run again"
+_REMEDY = "restore the file from a copy, or train the run again"
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -60,7 +60,7 @@ class _Document(dict[str, Any]):
         self._path = path
 
     def __missing__(self, key: str) -> Any:
-        raise RunError(f"does not contain {key!r}", where=str(self._path), remedy=_AGAIN)
+        raise RunError(f"does not contain {key!r}", where=str(self._path), remedy=_REMEDY)
 
 
 class Run:
@@ -106,7 +106,7 @@ class Run:
                 where=str(path),
                 remedy="give the directory that `restock train --out` wrote",
             )
-        document = read_json(config, error=RunError, remedy=_AGAIN)
+        document = read_json(config, error=RunError, remedy=_REMEDY)
         form = document.get("format")
         if form in _EARLIER:
             raise RunError(
@@ -180,7 +180,7 @@ class Run:
         if name not in self._written:
             file, schema = self.path / f"{name}.parquet", TABLES[name]
             self._written[name] = (
-                read_table(file, schema, error=RunError, remedy=_AGAIN)
+                read_table(file, schema, error=RunError, remedy=_REMEDY)
                 if file.exists()
                 else schema.empty_table()
             )
@@ -338,12 +338,12 @@ class RunLock:
             except BlockingIOError as error:
                 holder = os.read(file, 256).decode("utf-8", "replace")
                 os.close(file)
-                raise _refused(run, holder) from error
+                raise _lock_error(run, holder) from error
             except OSError:  # a file system without locks
                 os.close(file)
                 self._path.unlink(missing_ok=True)
                 return
-            if _is_at(file, self._path):
+            if _is_same_file(file, self._path):
                 self._file = file
             else:  # the last holder has removed the file since it was opened here
                 os.close(file)
@@ -358,14 +358,14 @@ class RunLock:
             self._file = None
 
 
-def _is_at(file: int, path: Path) -> bool:
+def _is_same_file(file: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(file), path.stat())
     except FileNotFoundError:
         return False
 
 
-def _refused(run: Path, holder: str) -> RunError:
+def _lock_error(run: Path, holder: str) -> RunError:
     process, _, machine = holder.partition(" ")
     here = machine == platform.node()
     named = f"process {process}{'' if here else f' on {machine}'}" if process else "another process"
@@ -407,7 +407,7 @@ class PolicyOrigin:
 def kept_policy(run: Run) -> PolicyOrigin | None:
     """Return the policy that would drive now; None without checkpoint and evaluation."""
     chosen = chosen_policy(run)
-    clocks = run_clocks(run) if chosen == "latest" else _values(run.best)
+    clocks = run_clocks(run) if chosen == "latest" else _read_state(run.best)
     if not clocks:
         best = [row for row in run.table("evaluations").to_pylist() if row["best"]]
         if not best:
@@ -425,7 +425,7 @@ def chosen_policy(run: Run) -> Literal["best", "latest", "mean"]:
 
 def latest_drives(run: Run) -> bool:
     """Return whether the run learned something that it never evaluated in the twin."""
-    latest, best = _values(run.latest), _values(run.best)
+    latest, best = _read_state(run.latest), _read_state(run.best)
     if not latest:
         return False
     progress = latest["progress"]
@@ -437,7 +437,7 @@ def latest_drives(run: Run) -> bool:
 
 def run_clocks(run: Run) -> dict[str, Any]:
     """Return the last checkpoint's clocks: steps, updates and seconds; empty without one."""
-    latest = _values(run.latest)
+    latest = _read_state(run.latest)
     if not latest:
         return {}
     progress = latest["progress"]
@@ -457,7 +457,7 @@ def env_steps_of(run: Run) -> int:
     return max(steps)
 
 
-def _values(path: Path) -> dict[str, Any]:
+def _read_state(path: Path) -> dict[str, Any]:
     """Return a checkpoint's state without loading arrays; empty if it cannot be read."""
     try:
         with safe_open(path, framework="numpy") as opened:

@@ -28,16 +28,16 @@ from restock.train.twin.missions import MISSIONS
 # WHAT of a measure -> the (condition, block) pairs whose mean success it is; block None: none.
 CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {
     **{
-        name: tuple((name, block) for block in one.blocks or (None,))
-        for name, one in MISSIONS.items()
+        name: tuple((name, block) for block in mission.blocks or (None,))
+        for name, mission in MISSIONS.items()
     },
     **{
         measure: ((name, block),)
-        for name, one in MISSIONS.items()
-        for measure, block in one.block_measures.items()
+        for name, mission in MISSIONS.items()
+        for measure, block in mission.block_measures.items()
     },
 }
-RARE = tuple(name for name, one in MISSIONS.items() if one.is_true is not None)
+RARE = tuple(name for name, mission in MISSIONS.items() if mission.is_true is not None)
 KINDS_OF_MEASURE = ("auc", "success")
 
 
@@ -47,7 +47,7 @@ def unknown_measure(name: str) -> str | None:
     if kind in KINDS_OF_MEASURE and what in (*CELLS, "rare"):
         return None
     return (
-        f"measure {name!r} must be {' or '.join(f'{one}_WHAT' for one in KINDS_OF_MEASURE)}, and"
+        f"measure {name!r} must be {' or '.join(f'{kind}_WHAT' for kind in KINDS_OF_MEASURE)}, and"
         f" WHAT rare, {', '.join(CELLS)}"
     )
 
@@ -80,13 +80,13 @@ class RunCurve:
 
     def __init__(self, path: Path) -> None:
         self._run = Run.open(path)
-        self._at = _by_step(self._run.table("evaluations"))
+        self._at = _success_by_step(self._run.table("evaluations"))
         self.steps = np.array(sorted(self._at))
 
     @cached_property
     def end(self) -> dict[tuple[str, str], float]:
         """Return the kept policy's success by condition and block."""
-        return _success(agent_episodes(self._run))
+        return _clean_success(agent_episodes(self._run))
 
     @property
     def conditions(self) -> list[tuple[str, int, float]]:
@@ -105,16 +105,16 @@ class RunCurve:
         """Return the run's value of a measure, an `auc` over the steps `reach`; NaN if unknown."""
         kind, _, what = measure.partition("_")
         if kind == "success":
-            return self._of(self.end, what)
+            return self._cells_mean(self.end, what)
         return area(self.steps, np.array(list(self.curve(what).values())), reach)
 
     def curve(self, what: str) -> dict[int, float]:
         """Return success in `what` by environment steps, one value per periodic evaluation."""
-        return {step: self._of(self._at[step], what) for step in self.steps.tolist()}
+        return {step: self._cells_mean(self._at[step], what) for step in self.steps.tolist()}
 
-    def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
+    def _cells_mean(self, success: Mapping[tuple[str, str], float], what: str) -> float:
         if what == "rare":
-            own = [self._of(success, kind) for kind in RARE]
+            own = [self._cells_mean(success, kind) for kind in RARE]
         else:
             own = [
                 success.get((condition, block or "none"), float("nan"))
@@ -167,8 +167,8 @@ def contrast(
     values = values[~np.isnan(values).any(axis=1)]
     if not len(values):
         return None
-    ahead = values[:, 0] - values[:, 1]
-    interval, p = paired_t(ahead)
+    differences = values[:, 0] - values[:, 1]
+    interval, p = paired_t(differences)
     interval = interval.within(-1.0, 1.0)  # each measure is a share
     return Contrast(
         arm,
@@ -181,22 +181,22 @@ def contrast(
         interval.value,
         _known(interval.low),
         _known(interval.high),
-        float(ahead.std(ddof=1)) if len(ahead) > 1 else None,
+        float(differences.std(ddof=1)) if len(differences) > 1 else None,
         _known(p),
-        no_interval=_why_no_interval(ahead),
+        no_interval=_explain_no_interval(differences),
     )
 
 
-def _why_no_interval(ahead: F64) -> str | None:
+def _explain_no_interval(differences: F64) -> str | None:
     """Return why `paired_t` gives no interval for paired differences (n,); None if it does."""
-    if (seeds := len(ahead)) < MIN_PAIRS:
+    if (seeds := len(differences)) < MIN_PAIRS:
         return f"{counted(seeds, 'seed')}, at least {MIN_PAIRS} are needed"
-    return "the same in every seed: nothing varies" if nothing_varies(ahead) else None
+    return "the same in every seed: nothing varies" if nothing_varies(differences) else None
 
 
 def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
     """Return the contrasts with Holm's adjusted p for all but the primary one."""
-    places = [i for i, one in enumerate(contrasts) if not one.primary and one.p is not None]
+    places = [i for i, c in enumerate(contrasts) if not c.primary and c.p is not None]
     adjusted = holm([float(contrasts[i].p or 0.0) for i in places])
     found = list(contrasts)
     for place, value in zip(places, adjusted, strict=True):
@@ -214,7 +214,7 @@ def learning_curves(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
     for arm, paths in arms.items():
         values: dict[tuple[str, int], list[float]] = {}
         for path in paths:
-            for condition, step, success in _curve_of(path):
+            for condition, step, success in _read_curve(path):
                 values.setdefault((condition, step), []).append(success)
         for (condition, step), found in sorted(values.items()):
             interval = paired_t(np.array(found))[0].within(0.0, 1.0)
@@ -232,7 +232,7 @@ def learning_curves(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _curve_of(path: Path) -> list[tuple[str, int, float]]:
+def _read_curve(path: Path) -> list[tuple[str, int, float]]:
     try:
         return RunCurve(path).conditions
     except RunError:
@@ -246,7 +246,7 @@ def training_cost(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
         last = [row for path in paths if (row := _last_progress(path)) is not None]
         cost: dict[str, Any] = {"arm": arm, "runs": len(last)}
         for name in ("env_steps", "gradient_steps", "wall_s"):
-            values = [one[name] for one in last]
+            values = [row[name] for row in last]
             cost[name] = float(np.mean(values)) if values and None not in values else None
         rows.append(cost)
     return rows
@@ -260,7 +260,7 @@ def _last_progress(path: Path) -> dict[str, Any] | None:
     return rows[-1] if rows else None
 
 
-def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
+def _success_by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
     """Return success by cell for each evaluation; of two at the same steps, the later one."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
     for row in table.to_pylist():
@@ -270,17 +270,17 @@ def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
             at = by_step[step] = (update, [])
         if at[0] == update:
             at[1].append(row)
-    return {step: _success_of(rows) for step, (_, rows) in by_step.items()}
+    return {step: _success_by_cell(rows) for step, (_, rows) in by_step.items()}
 
 
-def _success(table: pa.Table | None) -> dict[tuple[str, str], float]:
+def _clean_success(table: pa.Table | None) -> dict[tuple[str, str], float]:
     """Return the success of unperturbed episodes by condition and block."""
     if table is None:
         return {}
-    return _success_of([row for row in table.to_pylist() if row["perturbation"] == "none"])
+    return _success_by_cell([row for row in table.to_pylist() if row["perturbation"] == "none"])
 
 
-def _success_of(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str], float]:
+def _success_by_cell(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str], float]:
     cells: dict[tuple[str, str], list[bool]] = {}
     for row in rows:
         if row["success"] is not None:

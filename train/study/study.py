@@ -65,7 +65,7 @@ class StudyEvaluation(Checked, frozen=True):
             )
 
     @property
-    def of_kind(self) -> Mapping[str, int]:
+    def episodes_by_kind(self) -> Mapping[str, int]:
         """Return the number of episodes by kind."""
         if isinstance(self.episodes, dict):
             return self.episodes
@@ -206,7 +206,7 @@ def _refuse_shared_episodes(
     arm: ArmConfig, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
 ) -> None:
     """Raise ConfigError if an arm's policy would be judged on the episodes that select it."""
-    judged = FIRST_SEED, FIRST_SEED + max(evaluation.of_kind.values())
+    judged = FIRST_SEED, FIRST_SEED + max(evaluation.episodes_by_kind.values())
     if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
         raise ConfigError(
             f"arm {arm.name!r} would be evaluated on seeds {judged[0]} to {judged[1] - 1}, which "
@@ -299,18 +299,19 @@ def check_jobs(plan: StudyPlan) -> None:
         if made != requested:
             raise RunError(
                 "was trained with other settings than the study now gives: then "
-                f"{_only(made, requested)}, now {_only(requested, made)}",
+                f"{_difference(made, requested)}, now {_difference(requested, made)}",
                 where=str(job.path),
                 remedy="remove it, or give the study another --out",
             )
 
 
-def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Describe the items of request `one` that request `other` lacks."""
-    reported = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
+def _difference(request: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """Describe the items of `request` that `other` lacks or has with another value."""
+    settings = request.get("settings", ())
+    reported = [text for text in settings if text not in other.get("settings", ())]
     reported += [
         f"{key} = {json.dumps(value)}"
-        for key, value in one.items()
+        for key, value in request.items()
         if key != "settings" and other.get(key) != value
     ]
     return ", ".join(reported) or "the default"

@@ -103,7 +103,7 @@ def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) 
         for future in as_completed(futures):
             if (error := future.exception()) is None:
                 continue
-            if isinstance(error, RestockError) and not all(one.done() for one in futures):
+            if isinstance(error, RestockError) and not all(future.done() for future in futures):
                 say(str(error).splitlines()[0])
                 say("no more runs begin; waiting for those under way (Ctrl-C checkpoints them)")
             raise error
@@ -131,14 +131,14 @@ def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
     out = plan.panel(arm)
     if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
         return
-    store, mixture = _packed_from(plan, arm.mixture)
+    store, mixture = _mix_arguments(plan, arm.mixture)
     say(f"packing {mixture} for {arm.name}")
     out.parent.mkdir(parents=True, exist_ok=True)
     words = ["mix", store, "--mixture", mixture, "--out", str(out)]
     restock_verb(words, plan.out / "logs" / "mix.log")
 
 
-def _packed_from(plan: StudyPlan, mixture: str) -> tuple[str, str]:
+def _mix_arguments(plan: StudyPlan, mixture: str) -> tuple[str, str]:
     """Return the arguments of `restock mix` for a mixture: paths start at the study's folder."""
     store = str(plan.study.store)
     if "://" not in store:
@@ -162,7 +162,7 @@ def check_mixtures(plan: StudyPlan) -> None:
         and not panel.exists()
     ]
     for mixture in dict.fromkeys(to_pack):
-        plan_only(*_packed_from(plan, mixture))
+        plan_only(*_mix_arguments(plan, mixture))
 
 
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
@@ -260,16 +260,16 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
     `comparisons` are those of `run_study`.
     """
     compared = [
-        _compared(pair, comparison)
+        _comparison_json(pair, comparison)
         for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
     ]
-    refused = {(one["arm"], one["baseline"]) for one in compared if one["verdict"] != "comparable"}
+    refused = {(c["arm"], c["baseline"]) for c in compared if c["verdict"] != "comparable"}
     return {
         "doc": plan.study.doc,
         "seeds": list(plan.study.seeds),
         "rare": list(RARE),
         "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
-        "contrasts": [one.as_json() for one in contrasts(plan, refused)],
+        "contrasts": [found.as_json() for found in contrasts(plan, refused)],
         "arms": arms(plan),
         "curves": learning_curves(_finished(plan)),
         "cost": training_cost(_finished(plan)),
@@ -277,7 +277,7 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
     }
 
 
-def _compared(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
+def _comparison_json(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
     """Return a comparison as JSON values; in place of an error, one with the error as reason."""
     names = {"arm": pair.arm.name, "baseline": pair.baseline.name}
     if isinstance(comparison, RunError):
@@ -309,13 +309,13 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
     if (first := study.primary) is not None:
         own = next(pair for pair in study.pairs if pair.arm.name == first.arm)
         primary = own.arm, own.baseline, first.measure
-        wanted = [(*primary, True), *(one for one in wanted if one[:3] != primary)]
+        wanted = [(*primary, True), *(want for want in wanted if want[:3] != primary)]
     found = [
         contrast(arm.name, baseline.name, measure, curves.pairs(arm, baseline), primary=primary)
         for arm, baseline, measure, primary in wanted
         if (arm.name, baseline.name) not in refused
     ]
-    return with_holm([one for one in found if one is not None])
+    return with_holm([contrast for contrast in found if contrast is not None])
 
 
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
@@ -328,14 +328,14 @@ def arms(plan: StudyPlan) -> list[dict[str, Any]]:
     rows = []
     for arm in plan.study.arms:
         runs = [
-            _measured(_driven_by(path, "agent"), planner_s)
+            _measure(_read_driven(path, "agent"), planner_s)
             for path in plan.runs(arm)
             if (path / DONE).exists()
         ]
         if runs:
             rows.append({"arm": arm.name, "runs": len(runs), **_over_seeds(runs)})
     for name, episodes in references.items():
-        measured = _measured(episodes, planner_s)
+        measured = _measure(episodes, planner_s)
         rows.append({"arm": name, "runs": None, **_over_seeds([measured])})
     return rows
 
@@ -362,7 +362,7 @@ class _Curves:
         return self._read[path]
 
 
-def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
+def _read_driven(path: Path, policy: str) -> list[dict[str, Any]]:
     """Return the unperturbed episodes that `policy` drove in a run's evaluations."""
     return [
         row
@@ -375,11 +375,11 @@ def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[
     """Return the planner's times by mission, and the references' episodes by policy."""
     path = plan.jobs[0].path
     names = REFERENCES if path.is_dir() else ()
-    episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
+    episodes = {name: rows for name in names if (rows := _read_driven(path, name))}
     return planner_times(episodes.get("planner", [])), episodes
 
 
-def _measured(episodes: list[dict[str, Any]], planner_s: dict[Any, float]) -> dict[str, float]:
+def _measure(episodes: list[dict[str, Any]], planner_s: dict[Any, float]) -> dict[str, float]:
     """Compute the measures of one run's episodes; NaN if unknown."""
     cells: dict[str, list[float]] = {}
     for row in episodes:
@@ -413,7 +413,7 @@ def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None
 
 
 def _range(name: str) -> tuple[float, float]:
-    """Return the lowest and the largest possible value of a measure of `_measured`."""
+    """Return the lowest and the largest possible value of a measure of `_measure`."""
     if name.startswith("success "):
         return 0.0, 1.0
     return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf
