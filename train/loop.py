@@ -54,7 +54,7 @@ class TrainResult:
 
     env_steps: int
     gradient_steps: int
-    online_updates: int  # gradient steps made while it drove in the twin
+    online_updates: int  # gradient steps made while driving in the twin
     wall_s: float
     best: Score | None
     last: Score | None
@@ -241,7 +241,7 @@ def _run_updates(session: Session, count: int, phase: str, notify: Notify) -> No
 
 
 def _updates_to_make(session: Session, count: int) -> int:
-    """Return how many of `count` updates to make up to the next interval's end or target copy."""
+    """Return how many of `count` updates to make until an interval ends or the target is copied."""
     if session.blocks is None:
         count = 1 if session.batches.needs_td else min(count, LONGEST)
     step, rule = session.learner.gradient_steps, session.learner.target.rule

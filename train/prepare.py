@@ -96,7 +96,7 @@ class Prepared:
             teacher = open_teacher(
                 self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
             )
-        if teacher is not None and self.resumed is None:  # an error before anything is written
+        if teacher is not None and self.resumed is None:  # find errors before anything is written
             teacher.query(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
         lock = RunLock(self.path)

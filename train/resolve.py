@@ -112,7 +112,7 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
             where="teacher.successes",
             remedy="leave it out, or add drivers to teacher.policies",
         )
-    # If a teacher answers in the twin from the first step on, they slow learning: docs/train.md.
+    # Cloned successes slow learning down if a teacher answers in the twin: docs/train.md.
     return logged and not teacher.queried if teacher.successes is None else teacher.successes
 
 

@@ -144,7 +144,7 @@ class Session(Stateful):
     def plan(self) -> None:
         """Plan the shares of batches for the environment steps that the budget still allows.
 
-        A budget in seconds is converted by the steps per second so far. After online updates have
+        A budget in seconds is converted to steps by the speed so far. After online updates have
         begun, call this only just before a checkpoint, so that a resumed run has the same plan.
         """
         config, progress = self.config, self.progress
@@ -166,7 +166,7 @@ class Session(Stateful):
         made = progress.env_steps - (progress.online_from or 0)
         if made >= self.config.record.every_updates:
             return made / max(wall_s - progress.online_from_s, 1e-9)
-        # Online updates have just begun: add up the times of driving and of updates on the logs.
+        # Online updates have just begun: add the measured times of a driving step and its updates.
         step_s = (wall_s - progress.driving_from_s) / max(progress.env_steps, 1)
         update_s = self.config.schedule.updates_per_env_step * progress.offline_update_s
         return 1.0 / max(step_s + update_s, 1e-9)

@@ -183,12 +183,12 @@ def make_algorithm(config: LossConfig) -> Algorithm:
     """
     named = ALGORITHMS.get(config.algorithm)
     if named is None:
-        named = _imported(config.algorithm)
+        named = _import_named(config.algorithm)
     made: Algorithm = named(config)
     return made
 
 
-def _imported(source: str) -> Callable[[LossConfig], Algorithm]:
+def _import_named(source: str) -> Callable[[LossConfig], Algorithm]:
     """Import `module:name`, also from the working directory."""
     module, _, name = source.partition(":")
     here = str(Path.cwd())

@@ -146,24 +146,23 @@ def make_policy(
     config: TrainConfig, observation_size: int, actions: int, *, runs: int = 1
 ) -> PolicyNetwork:
     """Return the policy network of a run, or of a mean of `runs`, to load kept weights into."""
-    values = _of_runs([make_network(config, observation_size, actions) for _ in range(runs)])
+    values = _combine_runs([make_network(config, observation_size, actions) for _ in range(runs)])
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
     if not config.teacher.has_filter:
         return values
     behaviours = [make_behaviour(observation_size, actions) for _ in range(runs)]
-    return FilteredNetwork(values, _of_runs(behaviours))
+    return FilteredNetwork(values, _combine_runs(behaviours))
 
 
-def _of_runs(networks: Sequence[QNetwork]) -> Values:
+def _combine_runs(networks: Sequence[QNetwork]) -> Values:
     return networks[0] if len(networks) == 1 else Ensemble(networks)
 
 
 class Behaviour(Stateful):
     """The behaviour network with its optimizer and the ratio.
 
-    `average` is the average of its weights, which is evaluated and kept. `path` is how its gradient
-    is computed.
+    `average` is a network with the average of its weights, which is evaluated and kept.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates")

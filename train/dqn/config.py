@@ -24,8 +24,8 @@ from restock.train.twin.env.interface import LinearEpsilon
 from restock.train.twin.missions import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
-GIVEN = "given"  # the source of a teacher that Python code passed in
-PLANNER = "planner"  # the source of a teacher that the observation contains
+GIVEN = "given"  # `teacher.source` of a teacher that Python code passed in
+PLANNER = "planner"  # `teacher.source` if navigation's proposal, in the observation, teaches
 
 Count = Annotated[int, Meta(ge=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -169,7 +169,7 @@ class EnvConfig(Checked, frozen=True):
     missions: str | tuple[MissionOrder, ...] | None = None
     missions_share: Share = 0.5
     layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
-    # The name of a ready-made one, a TOML file, or its table; a schedule draws one per episode.
+    # Name of a ready-made perturbation, a TOML file or its table; a schedule draws one per episode.
     perturbation: str | dict[str, Any] = "nominal"
 
     def check(self) -> None:

@@ -221,7 +221,7 @@ class Kernel:
         return out
 
     def descend(self, gradient: F32) -> None:
-        """Compute the parameters' gradient from that of the last pass's first values (B, A)."""
+        """Compute the parameters' gradient, given that of the last pass's first values (B, A)."""
         self._network.backward(gradient)
 
     def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:

@@ -180,7 +180,7 @@ class FeedRecord(Stateful):
         return row_ids(self.logs, *(self._before if before else self._last))
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
-        """Close an interval, write the rows whose labels are known, and return `progress` means."""
+        """Close an interval, write the rows with known labels, and return means for `progress`."""
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
         logged, fresh = self._logged.columns, self._fresh.columns
         drawn = len(self._logged) + len(self._fresh)
@@ -222,7 +222,7 @@ class FeedRecord(Stateful):
         self._held = [HeldInterval(**interval) for interval in held]
 
     def _held_interval(self, clocks: dict[str, int], phase: str) -> HeldInterval:
-        """Return the fresh rows of the open interval."""
+        """Return the open interval's fresh rows, audits and quotas, to hold them for labels."""
         ring, filled = self.ring, len(self.ring)
         waiting = ring.by_condition.stratum[:filled] == WAITING
         available = self._count_by_stratum(ring.stratum[:filled][~waiting])

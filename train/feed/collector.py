@@ -344,7 +344,7 @@ def conditions_in_twin(
             words = {word.lower() for word in re.findall(r"\w+", condition.sql)}
             needed[condition.name] = sorted(words & set(signals))
             if not needed[condition.name]:
-                label(steps, [condition])  # says why
+                label(steps, [condition])  # raises the reason
     return evaluated, needed
 
 

@@ -130,13 +130,13 @@ class Practice(Stateful):
         return self.failure_rate if self._fixed is None else self._fixed
 
     @property
-    def believed(self) -> Bools:
+    def has_own_rate(self) -> Bools:
         """Return whether each arm has enough episodes for a rate of its own, (K,)."""
         return self._seen >= WARMUP_EPISODES
 
     @property
     def failure_rate(self) -> F64:
-        """Return each arm's failure rate over fading sums, with Jeffreys' prior, (K,).
+        """Return each arm's failure rate, with Jeffreys' prior, (K,); older episodes count less.
 
         It is the kind's rate if the arm has too few episodes, and 1 if the kind has too few.
         """
@@ -148,7 +148,7 @@ class Practice(Stateful):
         failures, episodes = of_kind(self._failures), of_kind(self._episodes)
         known = of_kind(self._seen) >= WARMUP_EPISODES
         rate = np.where(known, (failures + 0.5) / (episodes + 1), 1.0)
-        return np.where(self.believed, (self._failures + 0.5) / (self._episodes + 1), rate)
+        return np.where(self.has_own_rate, (self._failures + 0.5) / (self._episodes + 1), rate)
 
     def restored(self) -> None:
         """Give the twin the restored shares; those of a fixed rule are computed again."""
@@ -185,7 +185,7 @@ class Practice(Stateful):
                 "success": self._interval_successes[place] / self._interval_episodes[place]
                 if self._interval_episodes[place]
                 else None,
-                "success_rate": 1 - float(rate[place]) if self.believed[place] else None,
+                "success_rate": 1 - float(rate[place]) if self.has_own_rate[place] else None,
                 "weight": float(weights[place]),
                 "total_episodes": int(self._seen[place]),
             }
@@ -336,7 +336,7 @@ def make_twin(
 
 
 class NoTwin:
-    """A placeholder for the twin of a run on the logs alone; it cannot be driven in."""
+    """A placeholder for the twin of a run on the logs alone; a step in it raises an error."""
 
     num_envs = 1
 

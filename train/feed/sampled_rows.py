@@ -331,7 +331,7 @@ class SourceRows:
     rows: Mapping[str, NDArray[Any]]  # td, q, weight, action, reward, discount
     stratum: Ints
     strata: Sequence[str]
-    row: Ints  # its number in the source
+    row: Ints  # row numbers in the source
     available: Ints  # (S,) rows of each stratum in the source
     timings: Sequence[str | None]  # (S,)
     quota: Sequence[float | None]  # (S,)
@@ -346,7 +346,7 @@ class SourceRows:
 
     @cached_property
     def pair(self) -> Ints:
-        """Return the code of stratum and condition of each row (n,)."""
+        """Return one code per row (n,) for its stratum and condition."""
         return self.stratum * len(self.conditions) + self.condition
 
     @property
@@ -361,12 +361,12 @@ class SourceRows:
 
     @cached_property
     def drawn(self) -> Ints:
-        """Return the rows by cell (S, C, A)."""
+        """Return the number of rows in each cell (S, C, A)."""
         return self._by_cell(slice(None))
 
     @cached_property
     def unique(self) -> Ints:
-        """Return the distinct rows by cell (S, C, A)."""
+        """Return the number of distinct rows in each cell (S, C, A)."""
         return self._by_cell(first_places(self.row * len(self.strata) + self.stratum))
 
     def summed(self, values: NDArray[Any]) -> F64:

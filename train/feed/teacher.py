@@ -53,9 +53,9 @@ Label = NDArray[np.int16]
 class Teacher(Protocol):
     """A driver that returns its actions for N environments without driving them.
 
-    It may use the environment itself, which has more than the observation. It is queried once per
-    step, in order, and once before training begins. If it has `state_dict` and `load_state_dict`, a
-    resumed run continues exactly as if it had never stopped.
+    It may read the environment itself, not only the observation. It is queried once per step, in
+    order, and once before training begins. If it has `state_dict` and `load_state_dict`, a resumed
+    run continues exactly as if it had never stopped.
     """
 
     def act(self, env: Any, observation: F32, /) -> Ints:
@@ -449,8 +449,8 @@ def _measure_filter(learner: Learner, observation: F32, action: Ints) -> Mapping
 def refuse_no_rows(config: TeacherConfig, logged: Sequence[str] | None) -> None:
     """Raise ConfigError if the logs must have rows of the teacher's policies, but have none.
 
-    They must if no teacher is queried in the twin, or if there are logs and the config names other
-    policies than the default.
+    They must if no teacher is queried in the twin, or if there are logs and `teacher.policies` is
+    not the default.
 
     Args:
         logged: names of the logs' behaviour policies; None: there are no logs.

@@ -320,7 +320,7 @@ def _is_column(value: Any) -> bool:
     return hasattr(value, "__len__") and not isinstance(value, str | bytes)
 
 
-LOCK = ".lock"  # file in a run that names the process and machine which write it
+LOCK = ".lock"  # file in a run with the process and the machine that train it
 
 
 class RunLock:

@@ -109,7 +109,7 @@ class RunCurve:
         return area(self.steps, np.array(list(self.curve(what).values())), reach)
 
     def curve(self, what: str) -> dict[int, float]:
-        """Return success in `what` by environment steps, one value per periodic evaluation."""
+        """Return environment steps -> success in the cells of `what`, per periodic evaluation."""
         return {step: self._cells_mean(self._at[step], what) for step in self.steps.tolist()}
 
     def _cells_mean(self, success: Mapping[tuple[str, str], float], what: str) -> float:
