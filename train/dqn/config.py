@@ -244,7 +244,7 @@ def refuse_untaught(config: TrainConfig, *, within: str = "") -> None:
     if idle := [key for key in given if not has_effect(config, key)]:
         named = "not given" if source is None else f'"{source}"'
         raise ConfigError(
-            f"has no effect where teacher.source is {named}",
+            f"has no effect if teacher.source is {named}",
             where=f"{within}teacher.{idle[0]}",
             remedy="leave it out, or set teacher.source",
         )
@@ -334,5 +334,5 @@ def _apply(document: dict[str, Any], override: str) -> None:
     for section in sections:
         document = document.setdefault(section, {})
         if not isinstance(document, dict):
-            raise ConfigError(f"{key!r} is a key below a single value", where="--set")
+            raise ConfigError(f"{key!r} is below a key with a single value", where="--set")
     document[last] = value
