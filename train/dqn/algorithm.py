@@ -150,12 +150,12 @@ class DQN:
         td = q[chosen] - (scalars[:, 1] + scalars[:, 2] * next_value)
         size, half, scale = np.abs(td), np.float32(0.5), np.full(len(q), 1 / len(q), np.float32)
         delta = np.float32(self.settings.huber_delta)
-        each = np.where(size < delta, half * size * size, delta * (size - half * delta))
+        losses = np.where(size < delta, half * size * size, delta * (size - half * delta))
         if weight is not None:
-            each, scale = each * weight, scale * weight
+            losses, scale = losses * weight, scale * weight
         gradient = np.zeros_like(q)
         gradient[chosen] = np.clip(td, -delta, delta) * scale
-        loss, *of_rows = map(torch.from_numpy, (each, td, q[chosen]))
+        loss, *of_rows = map(torch.from_numpy, (losses, td, q[chosen]))
         return Loss(loss.mean(), *of_rows), gradient
 
     def _penalty(self, q: Tensor, batch: TrainingBatch) -> Tensor | None:
@@ -181,11 +181,10 @@ def make_algorithm(config: LossConfig) -> Algorithm:
     Raises:
         ConfigError: there is no such name, module or attribute.
     """
-    named = ALGORITHMS.get(config.algorithm)
-    if named is None:
-        named = _import_named(config.algorithm)
-    made: Algorithm = named(config)
-    return made
+    algorithm_class = ALGORITHMS.get(config.algorithm)
+    if algorithm_class is None:
+        algorithm_class = _import_named(config.algorithm)
+    return algorithm_class(config)
 
 
 def _import_named(source: str) -> Callable[[LossConfig], Algorithm]:
@@ -265,10 +264,10 @@ def dqn_loss(
     if weight is None:
         value = functional.huber_loss(chosen, wanted, delta=huber_delta)
     else:
-        each = functional.huber_loss(chosen, wanted, reduction="none", delta=huber_delta)
-        value = (each.squeeze(1) * weight).mean()
-    found = chosen.detach().squeeze(1)
-    return Loss(value, found - target, found)
+        losses = functional.huber_loss(chosen, wanted, reduction="none", delta=huber_delta)
+        value = (losses.squeeze(1) * weight).mean()
+    detached = chosen.detach().squeeze(1)
+    return Loss(value, detached - target, detached)
 
 
 def conservative_penalty(q: Tensor, action: Tensor, weight: float | Tensor = 1.0) -> Tensor:

@@ -70,8 +70,8 @@ def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
 def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
     """Return the mean of -log G(a|s), (), over rows (M,) with a known action; 0 without any."""
     known = action != UNKNOWN
-    each = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
-    return each.sum() / known.sum().clamp_min(1)
+    losses = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
+    return losses.sum() / known.sum().clamp_min(1)
 
 
 class FilteredNetwork(nn.Module):
@@ -115,8 +115,8 @@ class ProposalNetwork(nn.Module):
             np.zeros(shape[0]),
             np.zeros(shape[1]),
         )
-        for name, of in (("nearest", nearest), ("offset", offset), ("lead", margin * known)):
-            self.register_buffer(name, torch.from_numpy(np.asarray(of, np.float32)))
+        for name, buffer in (("nearest", nearest), ("offset", offset), ("lead", margin * known)):
+            self.register_buffer(name, torch.from_numpy(np.asarray(buffer, np.float32)))
 
     def preference(self, observation: Tensor) -> Tensor:
         """Return the amount added to each action value (B, A) of observations (B, D)."""

@@ -101,15 +101,15 @@ def fitted_q(
     for _ in range(config.iterations):
         for _ in range(config.updates):
             between()
-            some = torch.randint(len(rows), (config.batch_size,), generator=generator)
-            target = reward[some]
+            batch = torch.randint(len(rows), (config.batch_size,), generator=generator)
+            target = reward[batch]
             if before is not None:
                 with torch.no_grad():
-                    value = (policy[some] * before(next_observation[some])).sum(dim=1)
-                target = target + not_terminated[some] * value
+                    value = (policy[batch] * before(next_observation[batch])).sum(dim=1)
+                target = target + not_terminated[batch] * value
             if bounds is not None:
                 target = target.clamp(*bounds)
-            q = network(observation[some]).gather(1, action[some, None])[:, 0]
+            q = network(observation[batch]).gather(1, action[batch, None])[:, 0]
             # Not Huber's loss: the value is a mean, and rare large rewards must count in full.
             _descend(optimizer, nn.functional.mse_loss(q, target))
         decay.step()
@@ -140,8 +140,8 @@ def cloned_behaviour(
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     for _ in range(config.cloning_updates):
         between()
-        some = torch.randint(len(taken), (config.batch_size,), generator=generator)
-        _descend(optimizer, nn.functional.cross_entropy(network(seen[some]), taken[some]))
+        batch = torch.randint(len(taken), (config.batch_size,), generator=generator)
+        _descend(optimizer, nn.functional.cross_entropy(network(seen[batch]), taken[batch]))
     return network
 
 

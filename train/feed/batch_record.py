@@ -187,8 +187,8 @@ class FeedRecord(Stateful):
         means: dict[str, float | None] = dict.fromkeys(_MEANS)
         if drawn:
             sums = {
-                name: sum(float(of(rows[name]).sum(dtype=np.float64)) for rows in (logged, fresh))
-                for name, of in (("td", np.abs), ("q", np.asarray), ("reward", np.asarray))
+                name: sum(float(func(rows[name]).sum(dtype=np.float64)) for rows in (logged, fresh))
+                for name, func in (("td", np.abs), ("q", np.asarray), ("reward", np.asarray))
             }
             most = (np.abs(rows["q"]).max(initial=0.0) for rows in (logged, fresh))
             means = {

@@ -285,7 +285,7 @@ class Collector(Stateful):
             of_steps = codes[inside] if len(codes) else np.zeros(episode.steps, np.int64)
             strata = None
             if self.strata is not None:
-                of_episode = {name: of[inside] for name, of in held.items()}
+                of_episode = {name: holds[inside] for name, holds in held.items()}
                 strata = self.strata.codes(of_episode, episode.steps, self.ring.stratum_rows)
             self.ring.set_labels(episode.key, of_steps, strata)
             self.labels.note(episode.key, of_steps, strata)

@@ -159,10 +159,10 @@ def keep_rows(
         return
     weight = np.ones_like(values.td) if values.weight is None else values.weight
     of_rows = (values.td, values.q, weight, *values.tail.T)
-    *kinds, episode, step, policy, env_step, gradient_step = (of[slots] for of in of_ring)
+    *kinds, episode, step, policy, env_step, gradient_step = (column[slots] for column in of_ring)
     ages = (clocks[0] - env_step, clocks[1] - gradient_step)
-    of_logs = (log_rows, log_stratum, *(of[: len(log_rows)] for of in of_rows))
-    of_fresh = (*kinds, episode, step, policy, *ages, *(of[len(log_rows) :] for of in of_rows))
+    of_logs = (log_rows, log_stratum, *(part[: len(log_rows)] for part in of_rows))
+    of_fresh = (*kinds, episode, step, policy, *ages, *(part[len(log_rows) :] for part in of_rows))
     for columns, begin, every in ((logged_to, logged_at, of_logs), (fresh_to, fresh_at, of_fresh)):
         for column, found in zip(columns, every, strict=True):
             column[begin : begin + len(found)] = found
@@ -273,7 +273,7 @@ def add_names(
         "condition": names,
         "perturbation_values": None
         if values is None
-        else [None if of is None else [tuple(pair) for pair in of] for of in values],
+        else [None if row is None else [tuple(pair) for pair in row] for row in values],
     }
     del columns["key"], columns["of_stratum"]
     return columns
@@ -420,7 +420,7 @@ class GreedyRows:
 
 def strata(source: SourceRows, total: Ints) -> Columns:
     """Compute the columns of `strata`; `total` (S,) counts rows drawn since the run began."""
-    drawn, unique = (of.sum(axis=(1, 2)) for of in (source.drawn, source.unique))
+    drawn, unique = (cells.sum(axis=(1, 2)) for cells in (source.drawn, source.unique))
     sums = {name: by_pair.sum(axis=1) for name, by_pair in source.sums.items()}
 
     def mean(name: str) -> list[float | None]:
@@ -524,7 +524,7 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
         greedy = of_task(np.bincount(cell, minlength=source.pairs * count))
         looked_at = np.repeat(greedy.sum(axis=1), count)
         per_action = zip(greedy.ravel(), looked_at, strict=True)
-        share = [n / of if of else None for n, of in per_action]
+        share = [n / total if total else None for n, total in per_action]
         wanted = {"audited_rows": looked_at, "greedy_rows": greedy.ravel(), "greedy_share": share}
     of_pair = np.repeat(pairs, count)
     return {

@@ -430,8 +430,8 @@ def _measure_filter(learner: Learner, observation: F32, action: Ints) -> Mapping
     requested = answer != UNKNOWN
     teachers = answer.clamp_min(0)
 
-    def share(of: torch.Tensor) -> float | None:
-        return float(of[requested].float().mean()) if bool(requested.any()) else None
+    def share(holds: torch.Tensor) -> float | None:
+        return float(holds[requested].float().mean()) if bool(requested.any()) else None
 
     return {
         "ratio": float(learner.behaviour.ratio),

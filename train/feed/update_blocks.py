@@ -136,10 +136,10 @@ class UpdateBlocks:
         weight = [ones if batch.weight is None else batch.weight for batch in drawn]
         labels: Labelled | None = None
         if labelled and self.imitation is not None:
-            each = [self.imitation.draw_online() for _ in drawn]
+            batches = [self.imitation.draw_online() for _ in drawn]
             labels = Labelled(
-                torch.stack([of.observation for of in each]),
-                torch.stack([of.action for of in each]),
+                torch.stack([batch.observation for batch in batches]),
+                torch.stack([batch.action for batch in batches]),
             )
         block = UpdateBlock(
             rows=torch.from_numpy(np.stack(rows)),

@@ -63,8 +63,8 @@ def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
     """
     earlier, new = read_evaluations(run), set(_episode_keys(driven))
     kept = [name not in new for name in _episode_keys(earlier)]
-    whole = pa.concat_tables([earlier.filter(pa.array(kept, pa.bool_())), driven])
-    rows = whole.to_pylist()
+    episodes = pa.concat_tables([earlier.filter(pa.array(kept, pa.bool_())), driven])
+    rows = episodes.to_pylist()
     planner_s = planner_times(rows)
     lost = [
         row["time_s"] - planner_s[mission_of(row)]
@@ -72,11 +72,11 @@ def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
         else None
         for row in rows
     ]
-    place = whole.schema.get_field_index("time_lost_s")
+    place = episodes.schema.get_field_index("time_lost_s")
     column = pa.array(lost, pa.float64())
-    whole = whole.set_column(place, whole.schema.field(place), column)
-    write_table(whole, run / FILE)
-    return whole.slice(whole.num_rows - driven.num_rows)
+    episodes = episodes.set_column(place, episodes.schema.field(place), column)
+    write_table(episodes, run / FILE)
+    return episodes.slice(episodes.num_rows - driven.num_rows)
 
 
 def planner_times(rows: Iterable[Mapping[str, Any]]) -> dict[Mission, float]:
@@ -133,8 +133,8 @@ def trained_step(shown: pa.Table) -> int | None:
 def _floor_names(layouts: str) -> str:
     """Shorten a list of floors: file names without folders; of more than 3 the first and last."""
     names = [part.rpartition("/")[2].strip() for part in layouts.split(",")]
-    some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
-    return ", ".join(some)
+    shown = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
+    return ", ".join(shown)
 
 
 def _has_versions(policy: str) -> bool:

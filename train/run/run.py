@@ -367,11 +367,13 @@ def _is_same_file(file: int, path: Path) -> bool:
 
 def _lock_error(run: Path, holder: str) -> RunError:
     process, _, machine = holder.partition(" ")
-    here = machine == platform.node()
-    named = f"process {process}{'' if here else f' on {machine}'}" if process else "another process"
-    kill = f" (Ctrl-C, or `kill {process}`{'' if here else ' there'})" if process else ""
+    is_local = machine == platform.node()
+    kill, trainer = "", "another process"
+    if process:
+        trainer = f"process {process}" + ("" if is_local else f" on {machine}")
+        kill = f" (Ctrl-C, or `kill {process}`{'' if is_local else ' there'})"
     return RunError(
-        f"is being trained by {named}",
+        f"is being trained by {trainer}",
         where=str(run),
         remedy=f"wait until it has ended, or stop it{kill}; then run the same command again",
     )
