@@ -74,9 +74,8 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
     """Fill in the teacher's open settings: the operator teaches if the task has a goal.
 
     Raises:
-        ConfigError: a setting does not apply to the teacher's source; the planner is to teach, but
-            the profile does not read its commands; successes are to be cloned, but no goals are
-            logged; or rows are to be mirrored, but an action has no opposite.
+        ConfigError: a setting does not apply to the teacher's source, or the profile lacks what a
+            setting needs: the planner's commands, logged goals, an opposite of each action.
     """
     teacher = config.teacher
     if teacher.source is None:

@@ -59,8 +59,7 @@ class FeedOptions:
 
     run: str | Path | None = None  # the run directory to make; None: no record is kept
     logs_share: float | None = None  # share of a batch; None: as the panel's mixture
-    # Profile whose task and conditions the environment has. None: the panel's; without a panel
-    # warehouse_amr.
+    # Profile of the environment; None: that of the panel, or warehouse_amr without a panel.
     profile: str | None = None
     seed: int = 0  # of the draws, and of the choice of batches to audit
     audit_share: float = 0.01  # share of batches whose rows are all recorded

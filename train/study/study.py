@@ -279,12 +279,7 @@ class StudyPlan:
 
 
 def check_jobs(plan: StudyPlan) -> None:
-    """Check the jobs before any of them begins.
-
-    Raises:
-        RunError: a finished run was made with other settings.
-        ConfigError: an arm's panel does not exist.
-    """
+    """Raise RunError if a finished run has other settings, ConfigError if a panel is missing."""
     for job in plan.jobs:
         if not job.done.exists():
             if job.arm.panel and not (plan.folder / job.arm.panel / "panel.json").is_file():
