@@ -1,18 +1,20 @@
 """Alignment of all topics to one clock, the ticks of the control clock on it, and causal holds.
 
-Three clocks may be in a recording: when a message was received (`log_time`), sent, and measured
-(`header.stamp`). The profile names one, the alignment clock; every sample of every topic is put
-on it, and nothing is ever taken from a time after the tick that asks.
+A recording may have three clocks: the times when messages were received (`log_time`), sent, and
+measured (`header.stamp`). The profile chooses one as the alignment clock. Every sample of every
+topic gets a time on it, and a tick never uses a sample from a later time.
 
-A topic without a header is put on a `header.stamp` clock by subtracting the recording's offset: the
-smallest, over the stamped topics, of the median of (log time - stamp). Topics whose stamps are of
-another clock are left out of it, and count from their reception: commands (they take effect when
-they arrive) with another delay, and topics that alone are stamped later than they were received.
+On a `header.stamp` clock, a topic without a header gets log time minus the recording's offset. The
+offset is the smallest, over the stamped topics, of the median of (log time - stamp). Topics whose
+stamps come from another clock do not count for it, and are timed by their reception. These are
+commands with another delay (they take effect when they arrive), and topics that, unlike others, are
+stamped later than they were received.
+
 The offset is one constant per clock segment, unless it drifts by more than the tolerance, as in a
-simulation that runs slower than real time: then log time is mapped piece by piece (`ClockMap`).
-Either is measured over the whole segment, so it uses later messages' clocks, but never their
-values. If the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and
-only latched topics are held across.
+simulation that runs slower than real time. Then log time is mapped piecewise (`ClockMap`). Offset
+and map are measured over the whole segment, so they depend on the clocks of later messages, but
+never on their values. If the clock itself jumps (a simulation restarted, a clock was set), a new
+segment starts, and only latched topics are held across.
 """
 
 from __future__ import annotations
@@ -42,15 +44,15 @@ if TYPE_CHECKING:
     from restock.ingest.profile.tables import Clock
 
 NS = 1_000_000_000
-AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
-CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
+AHEAD_NS = 50_000_000  # a transform stamped further ahead is timed by its reception
+CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # time of a simulation
 BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
 TOLERANCE_S = 0.1  # half a control period
-IMPOSSIBLE_S = 0.25  # by which a stamp is after the reception, of a clock of its own
-OFTEN = 20  # messages: a topic with so many was there before and after a clock was set
-LATENCY_S = 1.0  # of a topic that is stamped by the recorder's clock, at most
-MAX_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
-Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
+IMPOSSIBLE_S = 0.25  # stamps this long after the reception come from another clock
+OFTEN = 20  # topics with so many messages have some before and after a clock was set
+LATENCY_S = 1.0  # largest latency of a topic that is stamped by the recorder's clock
+MAX_TICKS = 20_000_000  # per segment at a fixed rate: 46 days at 5 Hz, too many for the memory
+Rows: TypeAlias = "slice | NDArray[np.intp]"  # rows of a topic's columns; a slice takes no memory
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,10 @@ class Samples:
     """Messages of one topic on the alignment clock, in its order."""
 
     stamp_ns: Ints  # (N,) ascending
-    row: NDArray[np.intp]  # (N,) of the topic's columns
+    row: NDArray[np.intp]  # (N,) rows of the topic's columns
 
     def hold(self, tick_ns: Ints, max_age_s: float | None) -> LatestMessages:
-        """Return the latest sample at or before each tick (T,), ascending or not."""
+        """Return the latest sample at or before each tick (T,); ticks may be in any order."""
         at = np.searchsorted(self.stamp_ns, tick_ns, "right") - 1
         known = at >= 0
         if not len(self.stamp_ns):
@@ -75,12 +77,12 @@ class Samples:
 
 @dataclass(frozen=True)
 class LatestMessages:
-    """The latest message of a topic, at each of T ticks."""
+    """The latest message of a topic at each of T ticks."""
 
-    row: NDArray[np.intp]  # (T,) of the topic's columns; 0 where nothing is known
+    row: NDArray[np.intp]  # (T,) row of the topic's columns; 0 if there is no message yet
     age_ns: Ints  # (T,)
-    known: NDArray[np.bool_]  # (T,) something had been received
-    fresh: NDArray[np.bool_]  # (T,) and not longer ago than its maximum age
+    known: NDArray[np.bool_]  # (T,) whether there is a message
+    fresh: NDArray[np.bool_]  # (T,) whether there is one that is not older than the maximum age
 
     @classmethod
     def join(cls, parts: Sequence[LatestMessages]) -> LatestMessages:
@@ -94,22 +96,22 @@ class ClockSegment:
     """A stretch of a recording in which the alignment clock does not jump."""
 
     topics: Mapping[str, Samples]
-    clock_map: ClockMap  # log time to the alignment clock
+    clock_map: ClockMap  # maps log time to the alignment clock
 
 
 @dataclass
 class ClockReport:
-    """Findings about the clocks; kept with the recording's counts."""
+    """Findings about the clocks of a recording, stored with its counts."""
 
     alignment: str
     offset_ns: int = 0  # of the first segment
-    spread_ns: int = 0  # 1st to 99th percentile of what the offset, or the map, leaves unexplained
-    pace: float | None = None  # seconds of the robot's time in one of log time, where it drifts
-    mapped_by: str | None = None  # the topic whose times say so
-    jumps: int = 0
-    off_clock: dict[str, int] = field(default_factory=dict)  # messages left out, per topic
-    restamped: dict[str, int] = field(default_factory=dict)  # latched ones put at their log time
-    set_back: int = 0  # of them, times that the recorder's clock was set back
+    spread_ns: int = 0  # 1st to 99th percentile of the errors of the offset, or of the map
+    pace: float | None = None  # seconds of robot time per second of log time; None: no drift
+    mapped_by: str | None = None  # topic that the map is fitted to; None: constant offset
+    jumps: int = 0  # of the alignment clock, including `set_back`
+    off_clock: dict[str, int] = field(default_factory=dict)  # topic -> messages left out
+    restamped: dict[str, int] = field(default_factory=dict)  # topic -> latched, put at log time
+    set_back: int = 0  # how often the recorder's clock was set back
     by_reception: dict[str, int] = field(default_factory=dict)  # topic -> how far ahead it is, ns
 
 
@@ -122,20 +124,25 @@ def align(
     *,
     tolerance_s: float = TOLERANCE_S,
 ) -> tuple[list[ClockSegment], ClockReport]:
-    """Put every topic on the alignment clock, cut where that clock jumps.
+    """Convert every topic's times to the alignment clock, and cut segments where the clock jumps.
 
-    `topics` are in the order of their log time; stamped ones hold the field `header.stamp`.
-    A message whose stamp is more than JUMP_S from where its segment's clock has it is
-    left out and counted, but one of a `latched` topic (it may have been published long before
-    the recording began) is put at its log time instead. `transforms` may be stamped ahead: they
-    do not say what time it is, and count from when they were received. So do images of cameras.
-    Where the stamps of a topic of `commands` are further from the other topics' clock than
-    `tolerance_s`, its messages count from when they were received; so do those of a topic that
-    is stamped after its reception (`report.by_reception`).
+    A message whose stamp is more than JUMP_S off its segment's clock is left out and counted. A
+    topic that is stamped after its reception is timed by its reception (`report.by_reception`).
+
+    Args:
+        topics: in the order of log time; stamped topics have the field `header.stamp`.
+        clock: the profile's choice of the alignment clock.
+        latched: topics whose messages are never left out, but put at their log time, as they may
+            have been published long before the recording began.
+        transforms: topics of transforms, and cameras. They do not determine the clock's offset;
+            if they are stamped ahead, they are timed by their reception.
+        commands: topics that are timed by their reception if their stamps are further than
+            `tolerance_s` from the other topics' clock.
+        tolerance_s: largest error of the map from log time to stamps.
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, all log times
-            are the same while stamps go on, or log time cannot be mapped to the stamps within
+            are equal while stamps advance, or log time cannot be mapped to the stamps within
             `tolerance_s`.
     """
     report = ClockReport(clock.alignment)
@@ -159,8 +166,8 @@ def align(
 def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
     """Split each topic's messages at the points where the recorder's clock was set back.
 
-    There log time goes back on every frequent topic, by about as much, and over what was recorded.
-    Returns one empty part if it was not set back.
+    At such a point, log time goes back on every frequent topic by about the same time, to before
+    messages that were recorded already. Returns one empty part if the clock was never set back.
     """
     laps = {name: one.laps() for name, one in topics.items() if len(one) >= OFTEN}
     if not laps or len(set(laps.values())) > 1 or not max(laps.values()):
@@ -185,7 +192,7 @@ def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]
 
 
 def _part(columns: TopicColumns, rows: NDArray[np.intp]) -> TopicColumns:
-    """Take the times of some messages of a topic."""
+    """Return the times of some messages of a topic, without other fields."""
     kept = columns.fields.keys() & {STAMP, CLOCK_FIELD}
     fields: dict[str, FieldColumn] = {n: np.asarray(columns.fields[n])[rows] for n in kept}
     return TopicColumns(columns.log_time_ns[rows], columns.publish_time_ns[rows], fields)
@@ -239,7 +246,7 @@ def _align(
 
 
 def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
-    """Return whether stamps of the busiest stamped topic run at another pace than log time."""
+    """Return whether the stamps of the stamped topic with most messages drift from log time."""
     stamped = stamped_topics(topics, frozenset())
     reference = max(stamped.values(), key=len, default=None)
     if reference is None:
@@ -250,10 +257,9 @@ def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool
 def stamped_topics(
     topics: Mapping[str, TopicColumns], besides: frozenset[str]
 ) -> dict[str, TopicColumns]:
-    """Return every topic with header stamps and messages, except those `besides`.
+    """Return the topics with header stamps, except those in `besides`.
 
-    Drivers that do not fill stamps in leave them at zero: such a topic does not say what time it
-    is.
+    Topics whose stamps are all zero do not count: their drivers do not fill the stamps in.
     """
     return {
         name: columns
@@ -265,9 +271,10 @@ def stamped_topics(
 
 
 def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
-    """Find the topics stamped after their reception, and by how many ns.
+    """Return topics that are stamped after their reception, and by how many ns.
 
-    Only if others are stamped by the recorder's clock: if all are ahead, that clock is behind.
+    Empty unless another topic is stamped by the recorder's clock: if all topics are ahead, it is
+    the recorder's clock that is behind.
     """
     medians = {name: median(delay_ns(columns)) for name, columns in stamped.items()}
     limit = round(IMPOSSIBLE_S * NS)
@@ -277,21 +284,21 @@ def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
 
 
 def delay_ns(columns: TopicColumns, rows: Rows = slice(None)) -> Ints:
-    """Return log time - header stamp, (N,), of messages of a stamped topic.
+    """Return (log time - header stamp) of messages of a stamped topic, (N,).
 
-    Computed where it is needed: that of all topics would be half as large as all their times.
+    Not kept, as the delays of all topics would take half as much memory as all their times.
     """
     return columns.log_time_ns[rows] - np.asarray(columns.fields[STAMP], np.int64)[rows]
 
 
 def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[Ints, int]:
-    """Return a segment's ticks (T,) of the control clock, and how many commands got none.
+    """Return a segment's ticks (T,) of the control clock, and the number of commands without one.
 
-    `steps = "command"`: one tick a command, but none closer than 3/4 of the period to the last.
-    `steps = "rate"`: every period, from the first command to `end_ns`.
+    `steps = "command"`: one tick per command, except commands closer than 3/4 of the period to the
+    last tick. `steps = "rate"`: one tick per period, from the first command to `end_ns`.
 
     Raises:
-        RecordingError: a fixed rate gives more than MAX_TICKS, as a wrong time makes it do.
+        RecordingError: a fixed rate gives more than MAX_TICKS, due to a wrong time.
     """
     stamps = command.stamp_ns
     if not len(stamps):
@@ -317,11 +324,7 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
 
 
 def refuse_still_log_time(topic: str, columns: TopicColumns) -> None:
-    """Refuse a topic of several messages whose log times are all the same.
-
-    Raises:
-        RecordingError: they are; says what to do.
-    """
+    """Raise RecordingError if a topic has several messages that all have the same log time."""
     log = columns.log_time_ns
     if len(log) > 1 and log.max() == log.min():
         raise RecordingError(
@@ -333,16 +336,16 @@ def refuse_still_log_time(topic: str, columns: TopicColumns) -> None:
 
 
 def _edges(columns: TopicColumns, jump_ns: int) -> Ints:
-    """Return the log times (K,) at which segments begin; each segment has a message of the topic.
+    """Return the log times (K,), ascending, at which a topic's clock jumps and segments begin.
 
-    They ascend. Messages of one log time cannot be told apart by it, so they share a segment.
+    Each segment contains a message of the topic. Messages with the same log time share a segment.
     """
     edges = np.unique(jumps(columns.log_time_ns, delay_ns(columns), jump_ns))
     return np.asarray(edges[edges > columns.log_time_ns.min()], np.int64)
 
 
 def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
-    """Return which messages of a topic were received in a segment."""
+    """Return the rows of a topic's messages that were received in segment `index`."""
     if not len(edges):
         return slice(0, len(columns))
     return np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
@@ -351,17 +354,17 @@ def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
 def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
     """Return samples in stamp order, sharing memory if they are in that order already."""
     if (stamp_ns[1:] < stamp_ns[:-1]).any():
-        order = np.argsort(stamp_ns, kind="stable")  # of equal stamps the last received wins
+        order = np.argsort(stamp_ns, kind="stable")  # among equal stamps, the last received wins
         stamp_ns, row = stamp_ns[order], row[order]
     return Samples(stamp_ns, row)
 
 
 @dataclass
 class _Drifts:
-    """Decides for each segment between a constant offset and a piecewise map."""
+    """The choice, per segment, between a constant offset and a piecewise map of log time."""
 
     tolerance_ns: int
-    simulated: TopicColumns | None  # `/clock`, where it was read
+    simulated: TopicColumns | None  # `/clock`, if it was read
     report: ClockReport
 
     def map_of(
@@ -383,7 +386,7 @@ class _Drifts:
             for name in stamped.keys() - {reference}:
                 if len(delay := delay_ns(stamped[name], inside[name])):
                     medians.append(median(delay))
-            # Latency only ever adds to the clocks' offset: the least delayed topic shows it best.
+            # Latency only adds to the clocks' offset, so the topic with the least delay is best.
             offset = min(each for each in medians if abs(each - middle) <= jump_ns)
             return ClockMap.constant(offset), middle
         source, knots = reference, (log, late)
@@ -408,7 +411,7 @@ class _Drifts:
                 f" the {self.tolerance_ns / NS:g} s of half a control period",
                 remedy=BY_LOG_TIME,
             )
-        ahead = []  # of the map, by topic: the least delayed one shows best when it was sent
+        ahead = []  # of the map, per topic; the topic with the least delay is best
         for name, columns in stamped.items():
             log = columns.log_time_ns[inside[name]]
             if len(log):
@@ -428,7 +431,7 @@ class _Drifts:
         inside: Mapping[str, Rows],
         clock_map: ClockMap,
     ) -> None:
-        """Note the commands whose stamps are of another clock than this segment's."""
+        """Add commands whose stamps are off this segment's clock to `report.by_reception`."""
         for name in commands & topics.keys():
             if name in self.report.by_reception or STAMP not in topics[name].fields:
                 continue
@@ -478,7 +481,7 @@ def _segment(
 
 
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
-    """Carry each latched topic's latest message to the start of the next segment."""
+    """Repeat each latched topic's latest message at the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
         start = min(int(samples.stamp_ns[0]) for samples in topics.values() if len(samples.row))

@@ -1,6 +1,6 @@
-"""A profile's inputs in a recording on one clock: the latest message of each at every tick.
+"""A profile's inputs in a recording, on one clock, and the latest message of each at every tick.
 
-Ingest, the observer on a robot and a trace use this to find the message of an input at a tick.
+Ingest, the observer on a robot and `trace` use this to find an input's message at a tick.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from restock.ingest.steps.cameras import CameraFrames, usable_frames
 from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, poses_along
 from restock.ingest.steps.input_columns import InputColumns
 
-# A handover is announced on the tick it takes force; its message may arrive a moment later. Used
-# for provenance alone, never for what the robot knew.
+# A change of the behaviour policy is published at the tick from which it applies, and may arrive a
+# moment later. This lead is only for provenance, never for what the robot knew.
 PROVENANCE_LEAD_S = 0.1
-SAME_COMMAND = 1e-6  # m/s or rad/s: what only passes a command on does not change it
-SIDEWAYS_MPS = 1e-3  # slower is none
+SAME_COMMAND = 1e-6  # m/s or rad/s; commands that differ by less are the same one, passed on
+SIDEWAYS_MPS = 1e-3  # slower sideways speeds count as 0
 T = TypeVar("T")
 
 
@@ -52,14 +52,14 @@ class AlignedInputs:
     profile: Profile
     inputs: InputColumns
     segments: Sequence[ClockSegment]
-    ticks: Sequence[Ints]  # of each segment; T together
-    tree: Tree | None = None  # of the frames, where the profile has any
+    ticks: Sequence[Ints]  # of each segment; T in total
+    tree: Tree | None = None  # None: the profile has no [frames]
     clock: ClockReport = field(default_factory=lambda: ClockReport(""))
-    commands_between: int = 0  # commands that got no tick of their own
-    notes: Sequence[str] = ()  # what is odd about the frames, and left out of commands
+    commands_between: int = 0  # commands without a tick of their own
+    notes: Sequence[str] = ()  # about unusual frames, and ignored parts of commands
 
     def at(self, tick: int, stamp_ns: int) -> AlignedInputs | None:
-        """Return the inputs at one tick alone, or None if that tick is at another time."""
+        """Return the inputs at a single tick, or None if that tick is not at `stamp_ns`."""
         ends = np.cumsum([len(stamps) for stamps in self.ticks])
         segment = int(np.searchsorted(ends, tick, "right"))
         stamps = np.concatenate(self.ticks)[tick : tick + 1]
@@ -71,8 +71,8 @@ class AlignedInputs:
     def latest(self, name: str) -> LatestMessages:
         """Return an input's latest message at each tick; its age is negative if it comes later.
 
-        What the robot knew lies at or before the tick. The command of a fixed rate, and what only
-        says where a row comes from, may come a moment later.
+        What the robot knew is at or before the tick. The command at a fixed rate, and inputs that
+        are only provenance or truth, may come a moment later (`_lead_s`).
         """
         source, lead_ns = self.inputs.by_name[name], round(self._lead_s(name) * NS)
         latest = self.latest_of(source.topic, source.max_age_s, lead_ns=lead_ns)
@@ -87,7 +87,10 @@ class AlignedInputs:
     def latest_of(
         self, topic: str, max_age_s: float | None, *, lead_ns: int = 0, keep: Bools | None = None
     ) -> LatestMessages:
-        """Return a topic's latest message (of those to `keep`) at each tick, or a lead after it."""
+        """Return a topic's latest message up to `lead_ns` after each tick.
+
+        With `keep` (N,), only among these messages.
+        """
         parts = []
         for segment, stamps in zip(self.segments, self.ticks, strict=True):
             samples = segment.topics[topic]
@@ -98,7 +101,7 @@ class AlignedInputs:
         return LatestMessages.join(parts)
 
     def camera_frames(self) -> dict[str, CameraFrames]:
-        """Return the frames of each recorded camera, and those in force at the ticks."""
+        """Return the frames of each recorded camera, and those in force at the ticks, by name."""
         found: dict[str, CameraFrames] = {}
         for name, camera in self.profile.cameras.items():
             columns = self.inputs.topics.get(camera.topic)
@@ -106,7 +109,7 @@ class AlignedInputs:
                 continue
             stamp_ns = np.full(len(columns), -1)
             usable = np.zeros(len(columns), np.bool_)
-            for segment in self.segments:  # each by itself: a clock set back repeats its times
+            for segment in self.segments:  # separately, as a clock that is set back repeats times
                 samples = segment.topics[camera.topic]
                 stamp_ns[samples.row] = samples.stamp_ns
                 usable[samples.row] = usable_frames(
@@ -118,17 +121,17 @@ class AlignedInputs:
         return found
 
     def commanded_by(self) -> list[str | None]:
-        """Return the source whose command is the one in force at each tick, or None.
+        """Return the source whose command is in force at each tick, or None.
 
-        The search is at the time of the command, among the messages up to then: of the sources
-        whose last command is the same, the one with the latest, else one whose button is pressed. A
-        smoothed command equals no source's: the search is then at the last command of the topic
-        that it follows.
+        A source is found for each command, among the messages up to the command's time. It is the
+        source whose last command is equal, the latest if there are several; otherwise one whose
+        button is pressed. A smoothed command equals no source's command, so it gets the source of
+        the last message of `command_through`, which it follows.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
         through = self.profile.command_through
         chosen = "command" if through is None else COMMAND_THROUGH
-        if chosen not in self.inputs.by_name:  # nothing of the middle of the chain was recorded
+        if chosen not in self.inputs.by_name:  # `command_through` was not recorded
             return [None] * len(self.latest("command").row)
         topic = self.inputs.by_name[chosen].topic
         by = np.full(len(topics[topic]), None, object)
@@ -164,7 +167,7 @@ class AlignedInputs:
         return [follows[row] for row in self.latest("command").row]
 
     def poses(self) -> list[PoseSeries]:
-        """Return every pose of each segment, in the fixed frame."""
+        """Return all poses in the fixed frame, per segment."""
         if "pose" in self.inputs.by_name:
             topic = self.inputs.by_name["pose"].topic
             columns = [self.inputs.numbers("pose", key) for key in ("x_m", "y_m", "yaw_rad")]
@@ -177,11 +180,11 @@ class AlignedInputs:
         return poses_along(self.tree)
 
     def _lead_s(self, name: str) -> float:
-        """Return how much later than a tick an input's message may be measured."""
+        """Return by how much an input's message may be later than its tick."""
         half_s, by_rate = self.profile.task.control_period_s / 2, self.profile.clock.steps == "rate"
         leads = {
-            # At a fixed rate a command lands anywhere in the interval: the one in force for most
-            # of it is the one in force at its middle. On the command clock it opens the interval.
+            # At a fixed rate a command may come anywhere in the interval. The one in force at the
+            # middle is in force for most of it. With steps by command, it starts the interval.
             "command": half_s if by_rate else 0.0,
             "true_condition": half_s,  # the message nearest to the tick
             "true_exposure": half_s,
@@ -192,12 +195,12 @@ class AlignedInputs:
 
 
 def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> AlignedInputs:
-    """Align a recording's columns (those `wanted_fields` asks for) to one clock.
+    """Align a recording's columns (those of `wanted_fields`) to one clock.
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
-            cannot be mapped to it; its log times do not go on, or say that it took years; or no
-            transform leads to the pose.
+            cannot be mapped to it; log times are all equal, or span years; or no transform leads
+            to the pose.
     """
     inputs = InputColumns(profile, topics)
     edges = transforms_of(profile, inputs)
@@ -235,7 +238,7 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
 
 
 def _command_topics(inputs: InputColumns) -> frozenset[str]:
-    """Find the topics of which only commands are taken: they take effect when they are received."""
+    """Return topics read only for commands, which take effect when they are received."""
     topics: dict[bool, set[str]] = {True: set(), False: set()}
     for name, source in inputs.by_name.items():
         asks = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
@@ -263,10 +266,10 @@ def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict
 
 
 def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
-    """Return these topics except those of which only images are taken.
+    """Return the topics without those that are read only for images.
 
-    Keeping frames must change nothing about rows, so cameras affect neither the clock nor a
-    recording's end.
+    Keeping frames must not change rows, so cameras affect neither the clock nor the end of a
+    recording.
     """
     named = {source.topic for source in profile.sources.values()}
     named |= {signal.topic for signal in profile.signals.values()}
@@ -275,10 +278,10 @@ def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
 
 
 def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
-    """Return the transforms that pose, goals and plans need; none if the profile has no frames.
+    """Return the transforms that pose, goals and plans need; none if the profile has no [frames].
 
     Raises:
-        RecordingError: the pose is to come from them, and none of them joins its two frames.
+        RecordingError: the pose must come from transforms, and they do not connect its frames.
     """
     frames = profile.frames
     if frames is None:
@@ -293,7 +296,7 @@ def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
 
 
 def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSegment]) -> None:
-    """Find where in the fixed frame goals and plans are that were given in another one."""
+    """Set `inputs.placed`: the poses of the frames of goals and plans, if not the fixed frame."""
     fixed = plain(tree.frames.fixed)
     for name in ("goal", "plan"):
         frames = np.array([*inputs.frames_of(name), None], object)[:-1]
@@ -309,12 +312,12 @@ def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSeg
             rows = np.concatenate(
                 [one.row[keep] for one, keep in zip(samples, inside, strict=True)]
             )
-            # A latched message stands again at the start of later segments: the first counts.
+            # A latched message is repeated at the start of later segments; its first time counts.
             at.fill(rows[::-1], tree.place(frame, times), slice(None, None, -1))
 
 
 def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[str]:
-    """Describe what is odd about the frames of a recording."""
+    """Describe the origin of positions, and what is unusual about the frames of a recording."""
     notes = []
     if profile.origin_m is not None:
         x, y = profile.origin_m
@@ -336,7 +339,7 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
 
 
 def sideways_path(source: Input) -> str:
-    """Return the path of a command's speed to the left, beside that ahead; "" if it has none."""
+    """Return the path of a command's sideways speed (to the left); "" if unknown."""
     if given := source.fields.get("sideways_mps"):
         return element_of(given)[0]
     path = source.fields.get("speed_mps", "")
@@ -344,7 +347,7 @@ def sideways_path(source: Input) -> str:
 
 
 def sideways_notes(source: Input, fields: Mapping[str, FieldColumn]) -> list[str]:
-    """Count the commands that also ask for a speed sideways, which no action has."""
+    """Return a note that counts commands with a sideways speed, which no action has."""
     aside = np.asarray(fields.get(sideways_path(source), np.zeros(0)), np.float64)
     aside = aside * (factor_of("sideways_mps", source.fields.get("sideways_mps", "")) or 1.0)
     count = int((np.abs(aside) > SIDEWAYS_MPS).sum())

@@ -1,9 +1,9 @@
-"""The frames of a recording's cameras: what their bytes claim, which are kept, and their pixels.
+"""The frames of a recording's cameras: their layout, the choice of frames to keep, their pixels.
 
-A recording's images do not fit into memory. As its topics are read, each frame becomes its layout
-and the hash of its bytes; those that steps need are read again when they are written as rows.
-Nothing is decoded to see whether a frame can be kept: the headers of JPEG and PNG say its size, and
-their ends whether the file was cut. `pixels` decodes, and is called when somebody looks.
+A recording's images do not fit into memory. When its topics are read, only the layout and the hash
+of each frame are kept; frames that steps need are read again when they are written as rows. Frames
+are checked without decoding them: the header of a JPEG or PNG contains its size, and its end shows
+whether the file was cut. `pixels` decodes a frame for viewing.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from restock.ingest.task.schema import frame_schema, transition_ids
 
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 TYPES = (COMPRESSED, RAW)
-MAX_PIXELS = 100_000_000  # of a frame: more is no camera's
+MAX_PIXELS = 100_000_000  # per frame; no camera has more
 JPEG, PNG = "jpeg", "png"
-# Of raw images: type, channels, and the order in which they are red, green, blue (and alpha).
+# Encoding of raw images -> NumPy type, number of channels, and the channels' order that gives red,
+# green, blue (and alpha).
 ENCODINGS: dict[str, tuple[str, int, tuple[int, ...]]] = {
     "rgb8": ("u1", 3, (0, 1, 2)),
     "bgr8": ("u1", 3, (2, 1, 0)),
@@ -47,25 +48,25 @@ ENCODINGS: dict[str, tuple[str, int, tuple[int, ...]]] = {
 }
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # a palette's colours are three
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type -> channels; a palette (3) has RGB
 _PLAIN_MODES = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LA": "RGBA", "1": "L"}
-_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers that begin a frame's header
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
 
 
 class ImageProblem(ValueError):
-    """Why a message holds no image that can be kept; the same words for messages alike."""
+    """A message has no image that can be kept; the text is a reason by which they are counted."""
 
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """Size and format of an image, as needed to read its bytes."""
+    """Size and format of an image, as needed to decode its bytes."""
 
     encoding: str  # jpeg, png, or one of ENCODINGS
     width: int
     height: int
     channels: int
-    bits: int  # of a channel
-    row_bytes: int = 0  # of raw images
+    bits: int  # per channel
+    row_bytes: int = 0  # for raw images
     big_endian: bool = False
 
 
@@ -73,7 +74,7 @@ def compressed_layout(data: bytes, said: str) -> ImageLayout:
     """Read the layout of a JPEG or PNG file from its header; `said` is the message's format.
 
     Raises:
-        ImageProblem: it is neither, its header is damaged, or its end is missing.
+        ImageProblem: the file is neither, its header is damaged, or its end is missing.
     """
     if data.startswith(b"\xff\xd8"):
         layout = _jpeg(data)
@@ -93,7 +94,7 @@ def raw_layout(
     """Build the layout of a raw image from the fields of its message.
 
     Raises:
-        ImageProblem: an unknown encoding, or bytes that are not as many as the rest says.
+        ImageProblem: the encoding is unknown, or there are too few bytes for the size.
     """
     if encoding not in ENCODINGS:
         raise ImageProblem(f"unknown encoding {encoding[:60]!r}")
@@ -109,10 +110,12 @@ def raw_layout(
 
 
 def pixels(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
-    """Decode: (H, W) or (H, W, C) of red, green, blue (and alpha), uint8, uint16 or float32.
+    """Decode an image to (H, W), or (H, W, C) in the order red, green, blue (and alpha).
+
+    The type is uint8, uint16 or float32.
 
     Raises:
-        ImageProblem: the bytes are damaged, or not of this layout.
+        ImageProblem: the bytes are damaged, or do not have this layout.
     """
     if layout.encoding in (JPEG, PNG):
         return _decoded(data, layout)
@@ -151,7 +154,7 @@ def _bound(layout: ImageLayout) -> None:
 
 
 def _jpeg(data: bytes) -> ImageLayout:
-    """Read the layout of a JPEG from the markers before its scan."""
+    """Read the layout of a JPEG from the markers before its image data."""
     if data[-4096:].rstrip(b"\x00")[-2:] != b"\xff\xd9":  # some cameras pad with zeros
         raise ImageProblem("truncated JPEG: its end is missing")
     at = 2
@@ -182,7 +185,7 @@ def _png(data: bytes) -> ImageLayout:
     return ImageLayout(PNG, width, height, _PNG_CHANNELS[color], 8 if color == 3 else bits)
 
 
-# Names of fields hold no space.
+# Columns computed from frames. Their names have spaces, unlike names of the message's fields.
 ENCODING, PROBLEM, SHA256 = "frame encoding", "frame problem", "frame sha256"
 SIZE, WIDTH, HEIGHT = "frame size_bytes", "frame width", "frame height"
 CHANNELS, BITS, ROW_BYTES = "frame channels", "frame bits", "frame row_bytes"
@@ -198,7 +201,10 @@ def image_fields(kind: str) -> tuple[str, ...]:
 
 
 def other_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
-    """Return the first field that differs from ROS's definition of this type; None if none does."""
+    """Return the first field that is missing or differs from ROS's definition of this type.
+
+    None if there is no such field.
+    """
     found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
     fields = image_fields(kind)
     return next((name for name in fields if not _is_field(name, found.get(name))), None)
@@ -216,7 +222,7 @@ def _is_field(name: str, leaf: Leaf | None) -> bool:
 
 
 def frame_reduction(kind: str) -> Reduction:
-    """Build the reduction that turns a camera's messages into columns."""
+    """Build the reduction of a camera's messages to columns of their layouts and hashes."""
 
     def apply(fields: Fields) -> dict[str, FieldColumn]:
         payloads = image_bytes(fields)
@@ -252,7 +258,7 @@ def image_bytes(fields: Fields) -> list[bytes]:
 
 
 def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
-    """Return a function that gives an image's layout by row and bytes, or raises ImageProblem."""
+    """Return a function from row and bytes to the image's layout; it raises ImageProblem."""
     if kind == COMPRESSED:
         formats = np.asarray(fields["format"], object)
         return lambda row, data: compressed_layout(data, str(formats[row]))
@@ -269,7 +275,7 @@ def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
 
 NS = 1_000_000_000
 OFF_CLOCK = "its stamp does not fit the clock"
-MAX_REASONS = 20  # a file may give another one with each message
+MAX_REASONS = 20  # reasons counted separately, as every message could have another one
 
 
 @dataclass(frozen=True)
@@ -277,14 +283,14 @@ class CameraFrames:
     """A camera's N messages, and the frame in force at each of T ticks."""
 
     camera: Camera
-    columns: TopicColumns  # what its images are: `frame_columns`
-    stamp_ns: Ints  # (N,) on the alignment clock; -1 where it is off it
-    usable: Bools  # (N,) an image, on the clock, and not thinned out
-    at_tick: Ints  # (T,) the last usable frame received and not too old, or -1
+    columns: TopicColumns  # layouts and hashes, by `frame_reduction`
+    stamp_ns: Ints  # (N,) on the alignment clock; -1 if the stamp does not fit the clock
+    usable: Bools  # (N,) whether it is an image, on the clock, and not thinned out
+    at_tick: Ints  # (T,) index of the last usable frame that is not too old, or -1
 
     @property
     def problems(self) -> Counter[str]:
-        """Count messages without an image that can be kept, by reason."""
+        """Count the messages without an image that can be kept, by reason."""
         words = np.asarray(self.columns.fields[PROBLEM], object)
         off = (words == "") & (self.stamp_ns < 0)
         counted = Counter([word for word in words if word])
@@ -293,7 +299,7 @@ class CameraFrames:
         return most + Counter(rest)
 
     def in_force(self, ticks: Ints) -> tuple[Ints, Ints, Ints]:
-        """Return the frames in force at these ticks, and the first and last tick of each, (K,)."""
+        """Return the K frames in force at these ticks, and the first and last tick of each."""
         at = self.at_tick[ticks]
         seen = at >= 0
         frames, which = np.unique(at[seen], return_inverse=True)
@@ -304,7 +310,7 @@ class CameraFrames:
         return frames, first, last
 
     def account(self, kept: int, steps: int) -> dict[str, Any]:
-        """Count what became of the decoded messages: all counts but `steps` add up to them."""
+        """Count the decoded messages by outcome: kept, thinned, unused and problems add up."""
         problems = self.problems
         usable, decoded = int(self.usable.sum()), len(self.columns)
         return {
@@ -318,9 +324,9 @@ class CameraFrames:
 
 
 def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: float | None) -> Bools:
-    """Return which messages (S,), in stamp order, are frames to keep.
+    """Return which messages (S,), in stamp order, have a usable image.
 
-    With `max_hz`, the first in each 1 / max_hz seconds of the alignment clock.
+    With `max_hz`, only the first in each interval of 1 / max_hz seconds of the alignment clock.
     """
     problem = np.asarray(columns.fields[PROBLEM], object)[row]
     usable = np.asarray((problem == "") & (stamp_ns >= 0), np.bool_)
@@ -331,19 +337,19 @@ def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: floa
     return usable
 
 
-BATCH_BYTES = 32 << 20  # of images that are in memory together
+BATCH_BYTES = 32 << 20  # size of images from which a batch of rows is written
 
 
 @dataclass(frozen=True)
 class KeptFrames:
-    """The frames of one camera that a step of the recording has: K of its N messages."""
+    """The frames of one camera that are in force at some step: K of its N messages."""
 
     name: str
     frames: CameraFrames
     row: Ints  # (K,) ascending
-    first: Ints  # (K,) tick
-    last: Ints  # (K,)
-    steps: int  # that have one
+    first: Ints  # (K,) first tick at which the frame is in force
+    last: Ints  # (K,) last such tick
+    steps: int  # number of steps with a frame
 
     @classmethod
     def of(cls, name: str, frames: CameraFrames, ticks: Ints) -> KeptFrames:
@@ -352,7 +358,7 @@ class KeptFrames:
         return cls(name, frames, *frames.in_force(ticks), int((frames.at_tick[ticks] >= 0).sum()))
 
     def manifest_row(self, recording: Recording, file: str) -> dict[str, Any]:
-        """Return the counts of its messages, as `recordings.cameras` holds them."""
+        """Return the counts of the camera's messages, as a row of `recordings.cameras`."""
         topic = recording.topics[self.frames.camera.topic]
         sizes = np.asarray(self.frames.columns.fields[SIZE], np.int64)
         return {
@@ -367,10 +373,9 @@ class KeptFrames:
 
 
 def frame_rows(recording: Recording, kept: KeptFrames) -> Iterator[pa.RecordBatch]:
-    """Yield rows of `frame_schema`, some megabytes of images at a time.
+    """Yield batches of rows of `frame_schema`, each with about BATCH_BYTES of images.
 
-    A frame is known by its log time and its hash: a message that holds the same at the same moment
-    is the same frame.
+    Frames are identified by log time and hash: messages that are equal in both are the same frame.
     """
     columns, camera = kept.frames.columns, kept.frames.camera
     topic = recording.topics[camera.topic]

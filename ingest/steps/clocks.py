@@ -1,12 +1,12 @@
-"""The clocks of a recording: log time against header stamps, their faults, and a map between.
+"""The clocks of a recording: log times and header stamps compared, their faults, and a map.
 
-A recorder stamps a message when it receives it (log time), its sender may say when it sent it
-(publish time) and the message when it was measured (`header.stamp`). They can be different clocks:
-a constant apart (simulation time), zero, jumping, going back, repeating, or of another pace. A
-simulation runs at the pace that its computer allows: at 97 % of real time a constant offset is .9 s
-wrong after half a minute. What carries both times (`/clock` where it was recorded, else the stamped
-topic with most messages) says at which pace; between two of its messages the map is a line, so a
-message without a stamp is placed between the stamps that were received around it.
+A message may have three times: when the recorder received it (log time), when its sender sent it
+(publish time) and when it was measured (`header.stamp`). They may come from different clocks, and
+a clock can have a constant offset (simulation time), be zero, jump, go back, repeat, or run at
+another pace. A simulation runs at the pace that its computer allows: at 97 % of real time, a
+constant offset is .9 s wrong after half a minute. A topic with both times gives the pace: `/clock`
+if it was recorded, else the stamped topic with most messages. Between two of its messages the map
+is a line, so a message without a stamp is placed between the stamps that were received around it.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from restock.ingest.decoding.columns import TopicColumns
 
 JUMP_S = 1.0  # a change of (log time - stamp) by more means that a clock was set
 STAMP = "header.stamp"
-WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
+WIDE_NS = 100_000_000  # spread of (log time - stamp) from which `odd` reports it
 
 
 @dataclass(frozen=True)
 class TopicClock:
-    """Comparison of one topic's clocks. None: its messages carry no header stamp."""
+    """Comparison of one topic's clocks. Values are None if its messages have no header stamp."""
 
     topic: str
     messages: int
     publish_offset_ns: int | None  # log time - publish time, median; None without a message
-    offset_ns: int | None = None  # log time - header stamp, median, of stamps that are not zero
+    offset_ns: int | None = None  # log time - header stamp, median over nonzero stamps
     spread_ns: int | None = None  # … 1st to 99th percentile
-    jumps: int | None = None  # times that this difference changes by more than JUMP_S
-    backsteps: int | None = None  # stamps before that of the message received just before
-    duplicates: int | None = None  # messages whose stamp another one has, too
+    jumps: int | None = None  # how often this difference changes by more than JUMP_S
+    backsteps: int | None = None  # stamps lower than that of the message received just before
+    duplicates: int | None = None  # messages that repeat the stamp of another message
     zero_stamps: int | None = None
 
     def as_row(self) -> dict[str, str | int | bool | None]:
-        """Return plain values in the form of `recordings.clocks`, without aligning's findings."""
+        """Return a row of `recordings.clocks`, without the counts that alignment adds."""
         return {**asdict(self), "stamped": self.offset_ns is not None}
 
 
 def topic_clock(topic: str, columns: TopicColumns) -> TopicClock:
-    """Compare one topic's clocks. Messages are in the order of their log time."""
+    """Compare one topic's clocks. Its messages are in the order of log time."""
     log, publish = columns.log_time_ns, columns.publish_time_ns
     count = len(log)
     sent = median(log - publish) if count else None
@@ -78,7 +78,7 @@ def topic_clock(topic: str, columns: TopicColumns) -> TopicClock:
 
 
 def odd(row: Mapping[str, Any]) -> str:
-    """Describe what is unusual about a topic's clocks; "" if nothing is."""
+    """Describe what is unusual about a topic's clocks, given its row; "" if nothing is."""
     words = {
         "jumps": "jump",
         "log_backsteps": "log time backstep",
@@ -103,13 +103,13 @@ def topic_clocks(topics: Mapping[str, TopicColumns]) -> list[TopicClock]:
 
 
 def median(delay_ns: Ints) -> int:
-    """Return the (upper) median in integers, as float64 holds a time of day to 256 ns only."""
+    """Return the (upper) median in integers, as float64 rounds epoch times to 256 ns."""
     middle = len(delay_ns) // 2
     return int(np.partition(delay_ns, middle)[middle])
 
 
 def smoothed(delay_ns: Ints) -> Ints:
-    """Return the running median of five delays (N,), without single bad stamps."""
+    """Return the running median of five delays, (N,), which removes single bad stamps."""
     if len(delay_ns) < 5:
         return delay_ns
     smooth = delay_ns.copy()
@@ -126,27 +126,27 @@ def jumps(log_time_ns: Ints, delay_ns: Ints, jump_ns: int) -> Ints:
     """Return the log times at which a topic's clock jumps, ignoring single bad stamps."""
     change_ns = np.diff(delay_ns)
     if not (np.abs(change_ns, out=change_ns) > jump_ns).any():
-        return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do
+        return np.zeros(0, np.int64)  # smoothed delays do not change by more than delays do
     at = np.flatnonzero(np.abs(np.diff(smoothed(delay_ns))) > jump_ns) + 1
     return np.asarray(log_time_ns[at], np.int64)
 
 
-WINDOW_NS = 1_000_000_000  # in which a topic's least delay is looked at
+WINDOW_NS = 1_000_000_000  # window over which `drift_ns` takes the least delay
 
 
 @dataclass(frozen=True)
 class ClockMap:
-    """Log time to stamped time: lines between K knots, never going back.
+    """Map from log time to stamped time: piecewise linear between K knots, never decreasing.
 
     A single knot is a constant offset.
     """
 
-    log_ns: Ints  # (K,) ascending, no two equal
+    log_ns: Ints  # (K,) strictly ascending
     stamp_ns: Ints  # (K,) not descending
 
     @classmethod
     def constant(cls, offset_ns: int) -> ClockMap:
-        """Log time is always `offset_ns` ahead of stamped time."""
+        """Build the map with log time always `offset_ns` ahead of stamped time."""
         return cls(np.array([offset_ns], np.int64), np.zeros(1, np.int64))
 
     @classmethod
@@ -161,12 +161,12 @@ class ClockMap:
         """Fit the map through messages (N >= 1,) that carry both times, in any order."""
         order = np.argsort(log_ns, kind="stable")
         log, stamp = log_ns[order], np.maximum.accumulate(stamp_ns[order])
-        last = np.append(np.diff(log) > 0, True)  # of messages received at once, the newest stamp
+        last = np.append(np.diff(log) > 0, True)  # among messages of one log time, the newest stamp
         return cls(log[last], stamp[last])
 
     def stamped(self, log_ns: Ints) -> Ints:
-        """Return stamped times (N,) of log times (N,); beyond the knots at the map's mean pace."""
-        # Differences alone go through float64, which holds a time of day to 256 ns only.
+        """Convert log times (N,) to stamped times (N,); beyond the knots at the map's mean pace."""
+        # Only differences are converted to float64, which would round epoch times to 256 ns.
         first, last = int(self.log_ns[0]), int(self.log_ns[-1])
         start = int(self.stamp_ns[0])
         if first == last:
@@ -178,14 +178,14 @@ class ClockMap:
         return np.rint(inside).astype(np.int64) + start
 
     def logged(self, stamp_ns: Ints) -> Ints:
-        """Log times (N,) of stamped times (N,): the inverse of `stamped`."""
+        """Convert stamped times (N,) to log times (N,): the inverse of `stamped`."""
         if self.is_constant or not self.pace:
             return stamp_ns + self.offset_ns
-        last = np.append(np.diff(self.stamp_ns) > 0, True)  # stamps that stand still: the latest
+        last = np.append(np.diff(self.stamp_ns) > 0, True)  # among equal stamps, the latest
         return ClockMap(self.stamp_ns[last], self.log_ns[last]).stamped(stamp_ns)
 
     def ahead_by(self, shift_ns: int) -> ClockMap:
-        """Return the same map with stamps that much later."""
+        """Return the map with all stamps later by `shift_ns`."""
         return ClockMap(self.log_ns, self.stamp_ns + shift_ns)
 
     @property
@@ -196,7 +196,7 @@ class ClockMap:
 
     @property
     def offset_ns(self) -> int:
-        """Log time less stamped time, at the first knot."""
+        """Return log time minus stamped time at the first knot."""
         return int(self.log_ns[0] - self.stamp_ns[0])
 
     @property
@@ -207,8 +207,8 @@ class ClockMap:
 def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
     """Return by how much a topic's delays (N,) drift over a recording, without jitter.
 
-    Latency only ever adds to the clocks' offset, so each second's least delay shows the offset;
-    the drift is from the 5th to the 95th percentile of those.
+    Latency only adds to the clocks' offset, so the least delay in each second estimates the offset.
+    The drift is the span from the 5th to the 95th percentile of these estimates.
     """
     if not len(log_ns):
         return 0
@@ -225,10 +225,10 @@ def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
 
 
 def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
-    """Return how far messages (N,) with both times are from a map through their neighbours.
+    """Return the distance of messages with both times (N,) from a map through their neighbours.
 
-    Each half is put on a map through the other half, so the spread says how well a message
-    between two knots is placed. Empty for fewer than 4 messages.
+    Every other message is compared with a map through the rest, and the reverse, so the spread is
+    the error for a message between two knots. Empty for fewer than 4 messages.
     """
     if len(log_ns) < 4:
         return np.zeros(0, np.int64)

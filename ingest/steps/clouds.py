@@ -1,8 +1,8 @@
-"""Scans from the point clouds of a 3-D lidar, as ROS's pointcloud_to_laserscan makes them.
+"""Scans from the point clouds of a 3-D lidar, like those of ROS's pointcloud_to_laserscan.
 
-Points between two heights and two bearings become a scan: in each of its beams the nearest point,
-measured along the floor, or inf. A cloud is decoded by columns, in the layout that its own fields
-give, and its points are gone before the next one is read.
+Points between two heights and two bearings become a scan. Each of its beams has the distance of the
+nearest point, measured along the floor, or inf. Clouds are decoded column by column, in the layout
+that their own fields define, and one at a time, to save memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn
 from restock.ingest.profile.tables import Input
 
-BEAM_RAD = np.pi / 360  # from one beam to the next
+BEAM_RAD = np.pi / 360  # angle between two beams
 _FIELDS = ("fields[].name", "fields[].offset", "fields[].datatype")
 _SHAPE = ("height", "width", "point_step", "row_step", "is_bigendian")
 CLOUD_PATHS = (*_FIELDS, *_SHAPE, "data")  # of a sensor_msgs/msg/PointCloud2
@@ -28,8 +28,8 @@ _FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
 def cloud_reduction(source: Input, range_min_m: float) -> Reduction:
     """Build the reduction of clouds to scans, in the fields that `source` names.
 
-    A cloud without any point at `range_min_m` or farther has NaN ranges, as a lidar that sees
-    nothing. One that cannot be decoded has a NaN angle.
+    A cloud without any point at `range_min_m` or farther gets NaN ranges, like a lidar that sees
+    nothing. A cloud that cannot be decoded gets a NaN angle.
     """
     low, high = source.angle_rad or (-np.pi, np.pi)
     beams = max(round((high - low) / BEAM_RAD), 1)
@@ -54,7 +54,7 @@ def cloud_reduction(source: Input, range_min_m: float) -> Reduction:
 def points_of(fields: Fields, row: int) -> F64 | None:
     """Return the points (3, P) of one cloud in its own frame, in metres, NaN included.
 
-    None if it is cut short, or has no x, y, z as floats.
+    None if the cloud is cut short, or lacks x, y or z as a float.
     """
     names, offsets, kinds = (tuple(np.asarray(fields[path][row]).tolist()) for path in _FIELDS)
     height, width, step, row_step = (int(np.asarray(fields[path])[row]) for path in _SHAPE[:4])
@@ -65,7 +65,7 @@ def points_of(fields: Fields, row: int) -> F64 | None:
     short = (height - 1) * row_step + width * step > len(data)
     if layout is None or short or (height > 1 and row_step < width * step):
         return None
-    rows = (row_step, step)  # a row of an organised cloud may be padded, a point too
+    rows = (row_step, step)  # rows of an organised cloud, and points, may be padded
     table: NDArray[Any] = np.ndarray((height, width), layout, data.data, strides=rows)
     return np.stack([table[axis].ravel().astype(np.float64) for axis in "xyz"])
 
@@ -74,7 +74,7 @@ def points_of(fields: Fields, row: int) -> F64 | None:
 def _layout(
     names: tuple[str, ...], offsets: tuple[int, ...], kinds: tuple[int, ...], step: int, big: bool
 ) -> np.dtype[Any] | None:
-    """Return how x, y and z lie in a point; None if it has not all of them as floats."""
+    """Return the layout of x, y and z in a point; None if any is missing or not a float."""
     at = {name: place for place, name in enumerate(names)}
     if not {"x", "y", "z"} <= at.keys():
         return None
@@ -86,12 +86,12 @@ def _layout(
     xyz, at_byte = list("xyz"), [offsets[place] for place in places]
     try:
         return np.dtype({"names": xyz, "formats": formats, "offsets": at_byte, "itemsize": step})
-    except ValueError:  # beyond the end of a point
+    except ValueError:  # a field lies beyond the end of a point
         return None
 
 
 def _scan(source: Input, points: F64, range_min_m: float, low: float, beams: int) -> F32:
-    """Return the nearest point in each beam, in metres along the floor."""
+    """Return the distance of the nearest point in each beam, in metres along the floor."""
     x, y, z = points[:, np.isfinite(points).all(axis=0)]
     far = np.hypot(x, y)
     there = far >= range_min_m
@@ -99,7 +99,7 @@ def _scan(source: Input, points: F64, range_min_m: float, low: float, beams: int
     bottom, top = source.height_m or (-np.inf, np.inf)
     up = -z if source.upside_down else z
     beam = np.floor((np.arctan2(y, x) - low) / BEAM_RAD).astype(np.int64)
-    beam[beam == beams] -= 1  # the last bearing itself
+    beam[beam == beams] -= 1  # a point exactly at the last bearing
     kept = there & (bottom <= up) & (up <= top) & (beam >= 0) & (beam < beams)
     np.minimum.at(scan, beam[kept], far[kept].astype(np.float32))
     return scan

@@ -1,8 +1,8 @@
-"""Signals of one recording compared with each other: what contradicts itself, and what to do.
+"""Consistency checks of a recording: compare its signals, find contradictions, suggest remedies.
 
-Each check needs two independent sources of one quantity, and speaks only where most of the drive
-disagrees: slip, latency and noise differ for a while, a wrong unit or clock differs throughout.
-Ingest, `profile new` and `profile check` share these findings; the store keeps them.
+Each check needs two independent sources of one quantity, and reports a finding only if they differ
+for most of the drive: slip, latency and noise cause differences for a while, a wrong unit or clock
+throughout. Ingest, `profile new` and `profile check` report these findings; a store keeps them.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.task.task import Signals, wrap_angle
 
-WINDOW_S = 3.0  # in which two sources of a speed are compared
-MIN_WINDOWS = 5  # in which the robot moves; fewer say nothing
-APART = 1.25  # how many times the other one a speed is in three of four windows
-STILL = 0.05  # of the other one: less is standing
-MOVES = 0.2  # of the fastest command
-TURNS_RAD = 0.3  # in a window
-STEPS_PER_WINDOW = 2 / 3  # of its time that must be known
-BEYOND, BEYOND_MPS = 1.5, 0.1  # times the fastest command or wheels, and a margin
-OFTEN = 0.02  # of the steps
-SPIKE = 3.0  # times what commands and poses reach
-SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # beyond that: a robot may be carried
-SPIKES = 0.1  # of the messages, at most: more are another scale
+WINDOW_S = 3.0  # length of the windows in which two sources of a speed are compared
+MIN_WINDOWS = 5  # fewest windows with motion; fewer are no evidence
+APART = 1.25  # ratio of two speeds that is a contradiction, if in three of four windows
+STILL = 0.05  # a ratio below this means that the source stays at 0
+MOVES = 0.2  # the robot moves in a window if its mean speed is above this * the fastest command
+TURNS_RAD = 0.3  # smallest turn in a window in which yaw rates are compared
+STEPS_PER_WINDOW = 2 / 3  # share of a window's time that must be known
+BEYOND, BEYOND_MPS = 1.5, 0.1  # factor and margin above the fastest command or wheel speed
+OFTEN = 0.02  # share of the steps, or messages, from which a problem is reported
+SPIKE = 3.0  # factor above what commands and poses reach
+SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # above that: a robot may be carried
+SPIKES = 0.1  # largest share of messages that are spikes; more mean another scale
 MIN_STEPS = 5
-JUMP_M = 0.2  # further than that, less is the localiser's noise
-LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
+JUMP_M = 0.2  # shortest step of a jumping pose; less may be the localiser's noise
+LEADS, SURE = 0.03, 0.8  # smallest gain in correlation, and smallest correlation, for a lead
 MAX_LEAD_S = 1.0
-MIN_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
+MIN_FOLLOWED = 150  # fewest steps to correlate: in fewer, unrelated motions may look alike
 
 
 @dataclass(frozen=True)
@@ -45,37 +45,37 @@ class Finding:
 
     kind: str  # clock, sources, wheels, gyro, rates or order
     topic: str
-    what: str  # with its size
-    steps: int  # ticks concerned
-    cause: str  # the likely one
+    what: str  # the contradiction, with its size
+    steps: int  # number of ticks affected
+    cause: str  # likely cause
     remedy: str
-    repaired: bool = False  # else the rows are as recorded
+    repaired: bool = False  # False: rows contain the values as recorded
 
     def __str__(self) -> str:
         return f"{self.topic}: {self.what} ({self.steps:,} steps); {self.cause}; {self.remedy}"
 
     @property
     def reported(self) -> str:
-        """Return it as a line for people."""
+        """Return the finding as one line for the user."""
         return f"{'repaired' if self.repaired else 'contradicts itself'}: {self}"
 
     def as_row(self) -> dict[str, str | int | bool]:
-        """Return plain values, as `recordings.findings` holds them."""
+        """Return the finding as a row of `recordings.findings`."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The T steps of a recording by what they can be compared in."""
+    """The signals of a recording's T steps, divided into W windows for comparisons."""
 
     signals: Signals
-    joined: Bools  # (T,) known, and so is the step before, in the same stretch
-    seconds: F64  # (T,) since the step before; 0 where it is not joined
-    window: Ints  # (T,) which stretch of WINDOW_S it is in
+    joined: Bools  # (T,) usable, as is the step before, in the same clock segment
+    seconds: F64  # (T,) since the step before; 0 if not joined
+    window: Ints  # (T,) index of the window of WINDOW_S
 
     @classmethod
     def of(cls, signals: Signals, segment: Ints, problem: Sequence[str], longest_s: float) -> Drive:
-        """Make it of `signals`; steps further apart than `longest_s` are not joined."""
+        """Divide `signals` into windows; steps further apart than `longest_s` are not joined."""
         stamp = np.asarray(signals["stamp_ns"], np.int64)
         usable = np.array([each == "" for each in problem], np.bool_)
         gap_s = np.diff(stamp, prepend=stamp[:1]) / NS
@@ -89,24 +89,24 @@ class Drive:
         return cls(signals, joined, np.where(joined, gap_s, 0.0), window)
 
     def sums(self, values: F64) -> F64:
-        """Return the sum of values (T,) in each window (W,), of joined steps."""
+        """Return the sum (W,) of values (T,) over the joined steps of each window."""
         known = np.where(self.joined, np.nan_to_num(values), 0.0)
         return np.asarray(np.bincount(self.window, known), np.float64)
 
     def driven(self, name: str) -> F64:
-        """Return what a speed (T,) integrates to in each window (W,), with its sign."""
+        """Return the signed integral (W,) of a speed or yaw rate over each window."""
         speed = np.asarray(self.signals[name], np.float64)
         return self.sums((speed + np.roll(speed, 1)) / 2 * self.seconds)
 
     def full(self) -> Bools:
-        """Return which windows (W,) are known for enough of their time."""
+        """Return which windows (W,) have joined steps for enough of their time."""
         return np.asarray(self.sums(self.seconds) > STEPS_PER_WINDOW * WINDOW_S)
 
 
 def findings_of(
     aligned: AlignedInputs, signals: Signals, segment: Ints, problem: Sequence[str]
 ) -> list[Finding]:
-    """Find what contradicts itself in a recording, by its steps' signals (T,)."""
+    """Find contradictions in a recording from the signals of its steps (T,)."""
     profile = aligned.profile
     found = clock_findings(aligned.clock, len(problem))
     if not len(problem):
@@ -134,9 +134,9 @@ def findings_of(
 
 
 def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
-    """Find where the recorder's clock was set back, and the topics stamped by another clock.
+    """Report if the recorder's clock was set back, and the topics stamped by another clock.
 
-    Stamps of another clock than the others' were not used.
+    Alignment has ignored the stamps of these topics.
     """
     found = []
     if clock.set_back:
@@ -159,7 +159,7 @@ def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
 
 
 def _frames(inputs: InputColumns, steps: int) -> list[Finding]:
-    """Find topics whose messages are of several frames: each publisher names its own."""
+    """Find topics whose messages name several frames, which shows several publishers."""
     found: dict[str, Finding] = {}
     for name in ("pose", "wheels"):
         counts = Counter(inputs.frames_of(name))
@@ -181,7 +181,7 @@ def _frames(inputs: InputColumns, steps: int) -> list[Finding]:
 
 
 def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: float) -> list[Finding]:
-    """Find poses that step further than anything drove."""
+    """Find poses that jump: they step faster than commands and wheels explain."""
     signals, joined = drive.signals, drive.joined
     wheels = np.abs(signals["wheel_speed_mps"])[joined]
     most = max(fastest_mps, float(np.percentile(wheels, 99)) if len(wheels) else 0.0)
@@ -205,7 +205,7 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
 
 
 def _wheels(drive: Drive, topic: str, poses: str, fastest_mps: float) -> list[Finding]:
-    """Find wheels whose speed or yaw rate is another one than that of the poses."""
+    """Find wheels whose speed or yaw rate differs from that of the poses."""
     wheels = drive.driven("wheel_speed_mps")
     along = drive.driven("localised_speed_mps")
     path = np.maximum(np.abs(wheels), np.abs(along))
@@ -219,7 +219,7 @@ def _wheels(drive: Drive, topic: str, poses: str, fastest_mps: float) -> list[Fi
 
 
 def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
-    """Return the angles by a yaw rate and by the poses, of windows in which the robot turned."""
+    """Return the angles turned by a yaw rate and by the poses, in windows with enough turn."""
     yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
     by_rate, by_pose = drive.driven(name), drive.sums(wrap_angle(yaw - np.roll(yaw, 1)))
     turned = drive.full() & (np.maximum(np.abs(by_rate), np.abs(by_pose)) > TURNS_RAD)
@@ -229,9 +229,10 @@ def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
 
 
 def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: int) -> list[Finding]:
-    """Find a source that is off from the poses in one direction in three of four windows.
+    """Find a source that differs from the poses in one direction in three of four windows.
 
-    `of`: the finding's kind, its topic, what is compared, and the poses' topic.
+    `windows` are the values of source and poses; `of` are the finding's kind and topic, the
+    compared quantity, and the poses' topic.
     """
     source, poses = windows
     kind, topic, what, pose_topic = of
@@ -257,7 +258,7 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
 
 
 def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
-    """Find messages whose speed or turn neither commands nor poses come near."""
+    """Find single messages whose speed or yaw rate is far beyond that of commands and poses."""
     yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
     turned = wrap_angle(yaw - np.roll(yaw, 1)) / np.where(drive.joined, drive.seconds, np.inf)
     of_poses = {"speed_mps": drive.signals["localised_speed_mps"], "yaw_rate_radps": turned}
@@ -298,13 +299,13 @@ def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
 
 
 def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:
-    """Find motion that comes before the command that it follows."""
+    """Find motion that is stamped before the command that caused it."""
     for name in ("speed_mps", "yaw_rate_radps"):
         requested, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
         by_lag, most = _by_lag(requested, did, drive.joined, period_s)
         best = int(np.argmax(by_lag))
-        lead = most - best  # steps by which the motion comes before
-        # One step is no clock: a command may be sent when the motion of its step is over.
+        lead = most - best  # steps by which the motion is early
+        # One step is no evidence: a command may be sent when the motion of its step is over.
         if lead > 1 and by_lag[best] > max(SURE, max(by_lag[most:]) + LEADS):
             return [
                 Finding(
@@ -322,13 +323,16 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
 
 
 def _by_lag(requested: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
-    """Return `_correlation` at each lag from -n to n steps, and n."""
+    """Return `_correlation` at each lag from -n to n steps, and n, which is MAX_LEAD_S in steps."""
     most = max(1, round(MAX_LEAD_S / period_s))
     return [_correlation(requested, did, joined, lag) for lag in range(-most, most + 1)], most
 
 
 def _correlation(requested: F64, did: F64, joined: Bools, lag: int) -> float:
-    """Return how well a motion (T,) follows a command (T,) `lag` steps later; -1: unknown."""
+    """Return the correlation of a command (T,) with the motion (T,) `lag` steps later.
+
+    -1 if there are too few steps, or one of the two hardly varies.
+    """
     if lag > 0:
         requested, did, joined = requested[:-lag], did[lag:], joined[:-lag] & joined[lag:]
     elif lag < 0:

@@ -30,16 +30,16 @@ from restock.ingest.task.task import yaw_of
 
 @dataclass(frozen=True)
 class CustomColumn:
-    """A custom signal's values in one recording, message by message."""
+    """A custom signal's values in the N messages of its topic."""
 
     signal: CustomSignal
-    values: Ragged  # (N,) of a signal that is no list: one value a message, or none
-    unread: Sequence[str] = ()  # of each message that has one: a text that is no number
-    unmeasured: int = 0  # messages that say themselves that it was not measured
+    values: Ragged  # (N,) for a signal that is not a list: one value per message, or none
+    unread: Sequence[str] = ()  # first text that is not a number, of each message with any
+    unmeasured: int = 0  # number of messages that mark it as not measured
 
     @cached_property
     def samples(self) -> NDArray[np.bool_]:
-        """Return which messages have the one element that is meant, (N,)."""
+        """Return which messages have the element that the path selects, (N,)."""
         if not self.signal.picks:
             return np.ones(len(self.values), np.bool_)
         return np.asarray(self.values.lengths > 0, np.bool_)
@@ -52,12 +52,12 @@ class CustomColumn:
 
     @property
     def of_other_length(self) -> int:
-        """Count the messages that hold a vector of another length."""
+        """Count the messages whose vector has another length than required."""
         return 0 if self.signal.length is None else int((~self.whole).sum())
 
     @property
     def found(self) -> int:
-        """Count the messages that have it, as a number or a list of them."""
+        """Count the messages with a value: a finite number, or a list of the required length."""
         if self.signal.is_list:
             return int(self.whole.sum())
         return int(np.isfinite(np.asarray(self.values.values, np.float64)).sum())
@@ -76,16 +76,16 @@ class CustomColumn:
         rows = self.values.take(message[known])
         values = np.asarray(rows.values, np.float32)
         flat = pa.array(values, pa.float32(), mask=~np.isfinite(values))
-        offsets = np.zeros(len(message) + 1, np.int32)  # of no length where null: else Parquet may
-        offsets[1:][known] = rows.lengths  # not be written
+        offsets = np.zeros(len(message) + 1, np.int32)  # a null must have length 0, or writing
+        offsets[1:][known] = rows.lengths  # Parquet may fail
         offsets = np.cumsum(offsets, dtype=np.int32)
         return pa.ListArray.from_arrays(pa.array(offsets), flat, type=LIST, mask=pa.array(~known))
 
 
 def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] = ()) -> Reduction:
-    """Build the reduction that makes these signals' columns, all of one topic.
+    """Build the reduction that computes the columns of these signals, all of one topic.
 
-    Its messages have the fields `has`.
+    The topic's messages have the fields `has`.
     """
     fields = [path for signal in signals.values() for path in signal.wanted()]
     for signal in signals.values():
@@ -102,10 +102,12 @@ def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] =
 
 
 def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, FieldColumn]:
-    """Return a signal's values in N messages, and the texts among them that are not numbers.
+    """Compute a signal's values in N messages, the texts that are not numbers, and flags.
+
+    The flags mark messages in which it was not measured.
 
     Raises:
-        RecordingError: it is not a number a message, or a list of numbers.
+        RecordingError: the signal is not a number, or a list of numbers, per message.
     """
     path, count = signal.read, len(columns[signal.wanted()[0]])
     texts: dict[str, FieldColumn] = {}
@@ -146,22 +148,22 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
 
 
 def _measured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
-    """Replace values that messages declare as not measured by NaN."""
+    """Replace values by NaN that messages mark as not measured."""
     said = (said_in(columns, path)[read.message] for path in rule.said_by)
     return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *said))
 
 
 def _key(name: str) -> str:
-    """Name a signal among its topic's columns; names of fields hold no space."""
+    """Return the column of a signal in its topic; it has a space, unlike names of fields."""
     return f"signal {name}"
 
 
 def _numbers(
     values: NDArray[Any], mapping: Mapping[str, float] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Convert values (V,) to numbers, NaN if not one; also return which are not numbers."""
+    """Convert values (V,) to numbers or NaN; also return which values are not numbers."""
     texts = _texts(values)
-    found: dict[str, float | None] = {}  # text -> its number; None: it is none
+    found: dict[str, float | None] = {}  # text -> its number; None: not a number
     numbers = (
         {key.lower(): value for key, value in mapping.items()} if mapping is not None else None
     )
@@ -178,13 +180,13 @@ def _numbers(
 def _texts(values: NDArray[Any]) -> list[str]:
     """Convert values (V,) to a list of texts.
 
-    A NumPy array would give each the memory of the longest.
+    In a NumPy array, each text would take the memory of the longest.
     """
     return [str(value) for value in (values if values.dtype.kind == "O" else values.astype(str))]
 
 
 def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
-    """Reduce the finite elements of each message to one number; without any it has none."""
+    """Reduce the finite elements of each message to one number; without any, it has no value."""
     finite = np.isfinite(read.values)
     values, owner = np.asarray(read.values[finite], np.float64), read.message[finite]
     message, start, counts = np.unique(owner, return_index=True, return_counts=True)
@@ -201,12 +203,12 @@ def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
 class Custom:
     """The custom signals of a recording at its T steps."""
 
-    table: pa.Table  # T rows, a column a signal
-    columns: dict[str, CustomColumn]  # of the topics that the recording has
+    table: pa.Table  # T rows, one column per signal
+    columns: dict[str, CustomColumn]  # signals whose topic is in the recording
 
     @property
     def notes(self) -> list[str]:
-        """Describe what of the signals could not be used."""
+        """Describe values that could not be used, signal by signal."""
         return (
             [
                 f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages have"
@@ -229,7 +231,7 @@ class Custom:
         )
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the counts of each signal, as `recordings.signals` holds them."""
+        """Return the counts of each signal, as rows of `recordings.signals`."""
         rows = []
         for column in self.table.schema:
             about = {key.decode(): text.decode() for key, text in (column.metadata or {}).items()}
@@ -260,7 +262,7 @@ def _said(is_list: bool, length: str | None) -> str:
 
 
 def custom_signals(aligned: AlignedInputs) -> Custom:
-    """Hold every custom signal causally at every tick of every segment; null if unknown."""
+    """Compute every custom signal at every tick: its latest value, or null if unknown or stale."""
     columns: dict[str, CustomColumn] = {}
     count = sum(map(len, aligned.ticks))
     table = pa.table({"tick": np.arange(count)})
@@ -284,7 +286,7 @@ def latest_samples(aligned: AlignedInputs, column: CustomColumn) -> LatestMessag
 def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
     """Return a signal's values from its topic's columns."""
     fields: Fields = topic.fields
-    if _key(name) not in fields:  # columns of whole messages, as no recording's reader gives them
+    if _key(name) not in fields:  # whole messages, which the readers of recordings reduce
         fields = custom_reduction({name: signal}).apply(fields)
     values, texts = fields[_key(name)], fields.get(f"{_key(name)}, no number", np.zeros(0))
     assert isinstance(values, Ragged)

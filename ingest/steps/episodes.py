@@ -1,16 +1,16 @@
-"""The steps of a recording, and the episodes that they make.
+"""The steps of a recording, and their division into episodes.
 
-A step is a tick of its control clock, with all that is known at it. Where an episode begins, where
-it ends, and whether it terminated or was truncated:
+A step is a tick of the recording's control clock, with all that is known at it. These events end an
+episode:
 
-- The goal is reached: **terminated**. The steps after it, until there is another goal or the same
-  one is ordered again, belong to no episode.
-- A bump, where the task says so: **terminated**, a protective stop. It lasts until the bumper has
-  been free for RELEASE_S, and its steps belong to no episode: a robot that scrapes along a rack
-  has one bump there, and not an episode of one step for each touch.
-- A new goal, a lost route, the time limit: **truncated**, on the tick at which that is so. That
-  tick ends the old episode, seen with the old goal and plan, and is the first of the next one.
-- A gap, a clock jump, a pose jump, an unusable tick, the end: **truncated** on the tick before.
+- The goal is reached: **terminated**. Later steps belong to no episode, until there is another goal
+  or the same goal is ordered again.
+- A bump, if the task has `bump_terminates`: **terminated**, a protective stop. It lasts until the
+  bumper has been free for RELEASE_S, and its steps belong to no episode. So a robot that scrapes
+  along a rack has one bump there, and not an episode of one step for each touch.
+- A new goal, a lost route, the time limit: **truncated** at the tick of the event. That tick ends
+  the old episode, with the old goal and plan, and is the first of the next episode.
+- A gap, a clock jump, a pose jump, an unusable tick, the end: **truncated** at the tick before.
 """
 
 from __future__ import annotations
@@ -38,38 +38,38 @@ from restock.ingest.task.task_sql import observed_in_log
 
 @dataclass(frozen=True)
 class Steps:
-    """Every tick of a recording (T of them), with all that is known at it."""
+    """The T ticks of a recording, with all that is known at them."""
 
     signals: Signals  # every signal, leading axis T
-    segment: Ints  # (T,) of the clock
+    segment: Ints  # (T,) index of the clock segment
     follows: Bools  # (T,) comes directly after the tick before, and both are usable
     break_reason: list[str]  # (T,) why it does not follow, or ""
     problem: list[str]  # (T,) why the tick is unusable whatever its route, or ""
     route_problem: list[str]  # (T,) why its route is unusable, or ""
     routing: Routing
     action: Ints  # (T,)
-    residual: F64  # (T,) from the command to that action
+    residual: F64  # (T,) scaled distance from the command to that action
     policy: list[str]  # (T,)
     policy_version: list[str | None]  # (T,)
     probability: list[float | None]  # (T,)
-    truth: list[str | None]  # (T,) true condition, where a simulator published it
-    true_exposure: list[str | None]  # (T,) the same of exposures
+    truth: list[str | None]  # (T,) true conditions, if a simulator published them
+    true_exposure: list[str | None]  # (T,) likewise for exposures
     perturbed: Perturbed  # (T,) a simulator's parameters in force
     logged_ns: Ints  # (T,) log time
     clock: ClockReport
-    commands_between: int  # commands that got no tick of their own
-    custom: Custom  # the profile's own signals
+    commands_between: int  # commands without a tick of their own
+    custom: Custom  # the profile's custom signals
     cameras: dict[str, CameraFrames] = field(default_factory=dict)
-    clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
-    findings: list[Finding] = field(default_factory=list)  # what contradicts itself
-    notes: list[str] = field(default_factory=list)  # for people
-    stand_ins: dict[str, str] = field(default_factory=dict)  # of inputs that measured nothing
+    clocks: list[TopicClock] = field(default_factory=list)  # one per topic that was read
+    findings: list[Finding] = field(default_factory=list)  # contradictions between topics
+    notes: list[str] = field(default_factory=list)  # for the user
+    stand_ins: dict[str, str] = field(default_factory=dict)  # what replaces unmeasured inputs
 
     def __len__(self) -> int:
         return len(self.segment)
 
     def without_values(self) -> Steps:
-        """Keep what is known of the whole recording, and free what is known per tick."""
+        """Return a copy without values per tick, to free their memory."""
         ticks, flags = np.zeros(0, np.int64), np.zeros(0, np.bool_)
         return replace(
             self,
@@ -93,11 +93,10 @@ class Steps:
 
 
 def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
-    """Make all steps of a recording from its topics' columns (those `wanted_fields` asks for).
+    """Compute all steps of a recording from its topics' columns (those of `wanted_fields`).
 
     Raises:
-        RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is
-            not what its input needs.
+        RecordingError: as `align_inputs`, or a field does not have the type that its input needs.
     """
     clocks = topic_clocks(topics)
     aligned = align_inputs(profile, topics)
@@ -145,23 +144,23 @@ FAR = (
     "they may be UTM coordinates, which a store would round to decimetres: set `origin_m = [X, Y]` "
     "at the top of the profile, a point near the robot (`restock profile new` proposes one)"
 )
-RELEASE_S = 1.0  # that the bumper must have been free for before a robot drives on
+RELEASE_S = 1.0  # how long the bumper must be free before the next episode
 
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """Ticks `first` to `last`, both included; the last one only ends it."""
+    """An episode: ticks `first` to `last`, both included; the last tick only ends it."""
 
     first: int
     last: int
     terminated: bool
     ended_by: str
-    shared: bool  # the last tick is not used up: it begins the next episode, or is dropped
+    shared: bool  # whether the last tick also begins the next episode, or is dropped
 
 
 @dataclass(frozen=True)
 class Split:
-    """Episodes of a recording, and the ticks that are in none, by reason.
+    """Episodes of a recording, and the number of ticks outside of them, by reason.
 
     ticks = transitions + episode ends that are not shared + dropped.
     """
@@ -175,7 +174,7 @@ class Split:
 
     @property
     def ends(self) -> int:
-        """Return ticks that only end an episode."""
+        """Count the ticks that only end an episode."""
         return sum(not episode.shared for episode in self.episodes)
 
 
@@ -183,14 +182,14 @@ def split(task: Task, steps: Steps) -> Split:
     """Split a recording's steps into episodes."""
     changed, routing = changed_route(steps), steps.routing
     old_route = np.zeros(len(steps), np.bool_)
-    if len(changed):  # seen with the goal and plan of the tick before
+    if len(changed):  # computed with the goal and plan of the tick before
         goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
         old_route[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
     return _Walk(task, steps, terminated(task, steps.signals), old_route).walk()
 
 
 def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
-    """Return why a recording gives no transition, and the remedy if it is known."""
+    """Return why a recording has no transition, and the remedy if one is known."""
     reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     why = [f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons]
     off = steps.clock.off_clock
@@ -209,14 +208,14 @@ def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
 
 
 def changed_route(steps: Steps) -> Ints:
-    """Return ticks whose goal differs from that of the tick before, or is missing."""
+    """Return the ticks at which the goal of the tick before is replaced or lost."""
     goal = steps.routing.goal
     changed = np.flatnonzero(steps.follows[1:] & (goal[1:] != goal[:-1])) + 1
     return changed[goal[changed - 1] >= 0]
 
 
 def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) -> Signals:
-    """Return the signals at these ticks as if this goal and plan were in force."""
+    """Return the signals at ticks (n,) as if `goal` and `plan` (n,) were in force."""
     now = {name: column[ticks] for name, column in steps.signals.items()}
     now |= steps.routing.signals(task, goal, plan, now)
     if task.observed:
@@ -225,29 +224,29 @@ def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) ->
 
 
 def protective_stop(task: Task, steps: Steps) -> Bools:
-    """Return ticks (T,) within RELEASE_S of a press of the bumper, if a bump stops the robot."""
+    """Return which ticks (T,) are within RELEASE_S after a press, if bumps terminate episodes."""
     pressed = steps.signals["bumped"].astype(np.bool_) & task.bump_terminates
     latest = np.maximum.accumulate(np.where(pressed, np.arange(len(steps)), -1))
     stamp_ns = steps.signals["stamp_ns"]
     since_s = (stamp_ns - stamp_ns[latest]) * 1e-9
-    until_s = RELEASE_S - task.control_period_s / 2  # stamps jitter: to the nearest tick
+    until_s = RELEASE_S - task.control_period_s / 2  # rounds to the nearest tick: stamps jitter
     return (latest >= 0) & (since_s >= 0) & (since_s < until_s)
 
 
 class _Walk:
-    """Walks the ticks once, in order."""
+    """One pass over the ticks in order, which opens and closes episodes."""
 
     def __init__(self, task: Task, steps: Steps, terminated: Bools, old_route: Bools) -> None:
         self.task, self.steps = task, steps
         self.terminated = terminated  # (T,)
-        self.old_route_terminated = old_route  # (T,) by goal and plan of the tick before
+        self.old_route_terminated = old_route  # (T,) with the goal and plan of the tick before
         self.goal = steps.routing.goal.tolist()
         self.order = steps.routing.order.tolist()
         self.episodes: list[EpisodeSpan] = []
         self.dropped: Counter[str] = Counter()
         self.stopped = protective_stop(task, steps).tolist()
-        self.first: int | None = None  # of the open episode
-        self.done_with: tuple[int, int] | None = None  # the goal that was reached, and its order
+        self.first: int | None = None  # first tick of the open episode
+        self.done_with: tuple[int, int] | None = None  # goal and order that were reached last
 
     def walk(self) -> Split:
         follows = self.steps.follows.tolist()
@@ -259,7 +258,7 @@ class _Walk:
         return Split(self.episodes, dict(self.dropped))
 
     def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
-        """Return whether the open episode uses this tick; close it if it ends here or before."""
+        """Return whether the open episode uses this tick; close it if it ends by this tick."""
         if not follows:
             self._close(tick - 1, self.steps.problem[tick] or self.steps.break_reason[tick])
             return False

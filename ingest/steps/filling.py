@@ -1,8 +1,8 @@
-"""Every signal at every tick of the control clock, causally held, from the inputs on one clock.
+"""Computes every signal at every tick of the control clock from the latest message of each input.
 
-That includes the goal and plan in force, and the signals that follow from them. What makes a tick
-unusable (an input that is stale, a plan for another goal, a value that is not finite) is kept
-beside it as a reason, so that everything left out can be counted.
+That includes the goal and plan in force, and the signals that follow from them. If a tick is
+unusable (an input is stale, a plan is for another goal, a value is not finite), the reason is
+kept, so that everything left out can be counted.
 """
 
 from __future__ import annotations
@@ -59,26 +59,25 @@ from restock.ingest.task.task_sql import Past, observed_in_log
 from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
 from restock.ingest.task.tracks import Tracker
 
-# A number beyond this, in any unit that a signal has, is a fault: of a position, a store's float32
-# could not tell centimetres apart.
+# Larger numbers are faults, whatever the signal's unit. A position in float32, as stored, would not
+# even resolve centimetres.
 LARGEST = 1e6
 TOO_LARGE = "beyond a million"
-_CHUNK = 4096  # ticks at a time: bounds memory whatever the recording's length
+_CHUNK = 4096  # ticks processed at a time: bounds memory for recordings of any length
 
 
 @dataclass(frozen=True)
 class Routing:
-    """The goals and plans of a recording, and which are in force at each of T ticks.
+    """The goals and plans of a recording, and those in force at each of T ticks.
 
-    Without any, the way is straight ahead: look-ahead points on the robot's forward axis, and
-    nothing remaining.
+    A tick without a plan has look-ahead points on the robot's forward axis, and nothing remaining.
     """
 
     goals_m: F64  # (G, 2)
     plans_m: Sequence[F64]  # each (P, 2), map frame
-    goal: Ints  # (T,) index of a goal, the same for the same place; -1 is none
-    plan: Ints  # (T,) index of a plan; -1 is none
-    order: Ints  # (T,) the message with it: a goal may be ordered again
+    goal: Ints  # (T,) index of the goal, equal for goals at the same place; -1: none
+    plan: Ints  # (T,) index of the plan; -1: none
+    order: Ints  # (T,) index of the goal's message: the same goal may be ordered again
 
     @classmethod
     def none(cls, ticks: int) -> Routing:
@@ -87,7 +86,7 @@ class Routing:
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
     def view(self, task: Task, plan: Ints, pose: Signals) -> RouteView:
-        """Follow plan `plan[i]` from pose i to `plan_distances_m`, for N poses."""
+        """Find the points at `plan_distances_m` along plan `plan[i]`, seen from pose i of N."""
         count, at_m = len(plan), plan_distances_m(task)
         ahead = np.zeros((count, len(at_m), 2))
         ahead[:, :, 0] = at_m
@@ -110,7 +109,7 @@ class Routing:
         aimed = np.flatnonzero(goal >= 0)
         position = np.stack([now["pose_x_m"], now["pose_y_m"]], axis=-1)
         distance[aimed] = np.linalg.norm(self.goals_m[goal[aimed]] - position[aimed], axis=-1)
-        # Copies: of the points between them nothing is kept.
+        # Copied, so that the points between them are freed.
         near, far = (seen.look_ahead_m[:, part * PLAN_PARTS].T.copy() for part in (1, 2))
         way_m, gap_m = returns_on_plan(task, now["sector_clearance_m"], seen.look_ahead_m)
         return {
@@ -126,9 +125,9 @@ class Routing:
         }
 
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:
-        """Return how much shorter plan `plan[i]` became from `now` to `after`.
+        """Return by how much plan `plan[i]` became shorter from `now` to `after`, (N,).
 
-        Without a plan, how far the robot moved forward (along the mean of its two headings).
+        Without a plan, return how far the robot moved forward, along the mean of its two headings.
         """
         shorter: F64 = now["route_remaining_m"] - self.view(task, plan, after).remaining_m
         turn = after["pose_yaw_rad"] - now["pose_yaw_rad"]
@@ -139,7 +138,10 @@ class Routing:
 
 
 def same_goals(goals_m: F64, moved_m: float) -> Ints:
-    """Return for each goal (G, 2), in order, the first of its run of equal goals, (G,)."""
+    """Return for each goal (G, 2) the index of the first in its run of equal goals, (G,).
+
+    Goals are equal if they are at most `moved_m` apart.
+    """
     first = np.arange(len(goals_m), dtype=np.int64)
     for index in range(1, len(goals_m)):
         if np.linalg.norm(goals_m[index] - goals_m[first[index - 1]]) <= moved_m:
@@ -148,7 +150,7 @@ def same_goals(goals_m: F64, moved_m: float) -> Ints:
 
 
 def plan_problems(plans_m: Sequence[F64]) -> list[str]:
-    """Describe what is wrong with each plan by itself; "" if nothing is."""
+    """Return why each plan is unusable, whatever its goal; "" if it is not."""
     problems = []
     for plan in plans_m:
         if not len(plan):
@@ -160,7 +162,7 @@ def plan_problems(plans_m: Sequence[F64]) -> list[str]:
 
 
 def plan_ends(plans_m: Sequence[F64]) -> F64:
-    """Return the last point of each plan (P, 2); NaN if it has none."""
+    """Return the last point of each of P plans, (P, 2); NaN for an empty plan."""
     ends = np.full((len(plans_m), 2), np.nan)
     for index, plan in enumerate(plans_m):
         if len(plan):
@@ -168,9 +170,9 @@ def plan_ends(plans_m: Sequence[F64]) -> F64:
     return ends
 
 
-# What rows have in place of a field without an estimate, if it is not left unknown.
-GOAL_MOVED_M = 0.01  # from the last goal: more is a new one
-PLAN_GOAL_TOLERANCE_M = 0.5  # a plan that ends further from the goal is for another one
+GOAL_MOVED_M = 0.01  # a goal farther from the last one is a new goal
+PLAN_GOAL_TOLERANCE_M = 0.5  # a plan that ends farther from the goal is for another goal
+# What replaces a field of the IMU whose messages have no estimate, as text for notes.
 NO_ESTIMATE = {
     "angular_velocity": ": gyro yaw rate taken from the wheels",
     "linear_acceleration": ": acceleration 0",
@@ -178,7 +180,7 @@ NO_ESTIMATE = {
 
 
 class Filling:
-    """Every signal at every tick, from the latest messages at it; a tick's first problem stays."""
+    """Computation of all signals at T ticks; if a tick has several problems, the first is kept."""
 
     def __init__(self, aligned: AlignedInputs) -> None:
         self.aligned, self.inputs = aligned, aligned.inputs
@@ -188,20 +190,20 @@ class Filling:
         self.segment = np.repeat(np.arange(len(lengths)), lengths)
         self.problem = np.full(len(self.tick_ns), "", object)
         self.route_problem = np.full(len(self.tick_ns), "", object)
-        self.break_reason = np.full(len(self.tick_ns), "", object)  # why one does not follow
+        self.break_reason = np.full(len(self.tick_ns), "", object)  # why a tick does not follow
         self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
-        self.located = np.zeros(len(self.tick_ns), np.bool_)  # the pose is known
-        self.scan_m = np.zeros((0, FINE_SECTORS))  # of each tick, if tracks are asked for
+        self.located = np.zeros(len(self.tick_ns), np.bool_)  # whether the pose is known
+        self.scan_m = np.zeros((0, FINE_SECTORS))  # (T, FINE_SECTORS) if the task has tracks
         self.scan_stamp_ns = np.zeros(len(self.tick_ns), np.int64)
         self.notes: list[str] = []
-        self.stand_ins: dict[str, str] = {}  # of inputs none of whose messages has an estimate
+        self.stand_ins: dict[str, str] = {}  # replacements of inputs that never have an estimate
 
     def fill(self, tracker: Tracker | None = None, past: Past | None = None) -> Signals:
-        """Compute every signal; the attributes then hold what else is known of the ticks.
+        """Compute every signal, and fill the other attributes.
 
-        `tracker` and `past` know the ticks before the last one, as a running robot's do; only the
-        last one then has tracks, and entries of the task's own.
+        On a running robot, `tracker` and `past` hold the state of the ticks before the last one.
+        With them, tracks and the task's own entries are computed only for the last tick.
         """
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
@@ -241,7 +243,7 @@ class Filling:
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
         if lateral_by_poses is not None:
-            # Speeds of one and the same poses: no second witness, so never slip.
+            # Wheel and localised speed both come from the poses, so they never show slip.
             forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
         scanned = {name: signals[name] for name in SCANNED}
@@ -259,7 +261,7 @@ class Filling:
         return signals
 
     def _observed(self, signals: Signals, past: Past | None) -> F32:
-        """Compute the task's own entries of the observation."""
+        """Compute the task's own observation entries (T, E)."""
         if past is None:
             return observed_in_log(self.task, signals, self.follows)
         one, now = np.array([0]), {name: column[-1:] for name, column in signals.items()}
@@ -270,7 +272,7 @@ class Filling:
         return np.repeat(past.now(one), len(self.tick_ns), axis=0)
 
     def _tracks(self, signals: Signals, tracker: Tracker | None) -> Signals:
-        """Track who moves, tick by tick; anew where one does not follow the tick before."""
+        """Run the tracker over the ticks; it starts anew at a tick that does not follow."""
         count, one = len(self.tick_ns), np.array([0])
         ticks = range(count) if tracker is None else range(count - 1, count)
         tracker = tracker or Tracker(self.task)
@@ -293,7 +295,7 @@ class Filling:
         return np.asarray(self.break_reason == "", np.bool_)
 
     def behaviour(self) -> list[tuple[str, str | None, float | None]]:
-        """Return who acted at each tick: policy, version, probability of the action."""
+        """Return the behaviour policy at each tick: name, version, probability of the action."""
         default, by = self.profile.behaviour_policy, self.aligned.commanded_by()
         found = [
             (source or default, None, None) if text is None else parse_policy(text)
@@ -311,7 +313,7 @@ class Filling:
         ]
 
     def texts(self, name: str) -> list[str | None]:
-        """Return the latest text of an input at each tick, or None."""
+        """Return the latest text of an input at each tick; None if missing or stale."""
         if name not in self.inputs.by_name:
             return [None] * len(self.tick_ns)
         texts, latest = self.inputs.texts(name), self.aligned.latest(name)
@@ -319,7 +321,7 @@ class Filling:
         return [texts[row] if fresh else None for row, fresh in rows]
 
     def perturbed(self) -> Perturbed:
-        """Return the simulator's parameters in force at each tick, and what could not be read."""
+        """Return the simulator's parameters in force at each tick, and notes on unreadable ones."""
         if "perturbation" not in self.inputs.by_name:
             return Perturbed.unknown(len(self.tick_ns))
         latest = self.aligned.latest("perturbation")
@@ -342,7 +344,7 @@ class Filling:
             reasons[1:][bad & (reasons[1:] == "")] = reason
 
     def _too_far(self, xy_m: F64) -> Bools:
-        """Return which steps (N - 1,) between positions (N, 2) are too long to be driven."""
+        """Return which steps (N - 1,) between positions (N, 2) exceed `max_pose_jump_m`."""
         moved_m = np.hypot(*np.diff(xy_m, axis=0).T)
         return np.asarray(moved_m > self.profile.episodes.max_pose_jump_m, np.bool_)
 
@@ -351,7 +353,7 @@ class Filling:
         problems[bad & (problems == "")] = reason
 
     def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
-        """Mark the ticks that have a reason (T,), which is "" elsewhere."""
+        """Mark ticks as invalid by their reasons (T,); "" marks nothing."""
         for reason in sorted(set(reasons) - {""}):
             said = f"{name}: {reason}" if name else reason
             self._mark_invalid(reasons == reason, said, route=route)
@@ -365,9 +367,9 @@ class Filling:
     def _numbers(
         self, name: str, instead: Mapping[str, F64] | None = None, /, **signal_of: str
     ) -> None:
-        """Write fields of a required input to signals; 0 where the tick is unusable.
+        """Convert fields of a required input to signals; a tick is 0 if its value is unusable.
 
-        A tick whose message has no estimate takes the value `instead` of it, if there is one.
+        A message without an estimate is replaced by `instead`, if given, else it is a problem.
         """
         latest = self._required(name)
         for key, signal in signal_of.items():
@@ -388,7 +390,7 @@ class Filling:
         self.signals[signal] = np.where(sane & known, values, 0.0)
 
     def _wheels(self) -> F64 | None:
-        """Return the wheels' speeds, and the speed sideways (T,) if they come from poses."""
+        """Set the wheels' speeds; if they come from poses, return the sideways speed (T,)."""
         motion = self.profile.motion
         if motion is None:
             speeds = {"speed_mps": "wheel_speed_mps", "yaw_rate_radps": "wheel_yaw_rate_radps"}
@@ -429,10 +431,10 @@ class Filling:
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
     def _scans(self) -> None:
-        """Return clearance by the scans: with several lidars, the nearest of any.
+        """Set the clearance; with several lidars, the smallest of all.
 
-        A robot without a lidar has none, and one that has a lidar may not go without: recordings
-        without scans are read by `as_recorded`, with a task without sectors.
+        Clearance is NaN for a task without a lidar. If the task has a lidar but the recording lacks
+        scans, no tick is usable; `as_recorded` makes the task fit a recording without scans.
         """
         count = len(self.tick_ns)
         sectors = np.full((count, self.task.sectors), np.nan)
@@ -448,10 +450,10 @@ class Filling:
         self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
 
     def _scan(self, name: str, source: Input, sectors: F64) -> None:
-        """Put the clearance by one lidar into `sectors` (T, K), where it is less or not known."""
+        """Lower `sectors` (T, K) to the clearance of one lidar; NaN there means not yet known."""
         latest, count = self._required(name), len(self.tick_ns)
         fields: Fields = self.inputs.topics[source.topic].fields
-        if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
+        if SECTORS not in fields:  # whole scans, which the readers of recordings reduce
             fields = scan_reduction(self.task, source).apply(fields)
         if near := int(np.asarray(fields[CLOSE]).sum()):
             self.notes.append(
@@ -480,7 +482,7 @@ class Filling:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
         source = self.inputs.by_name.get("bumper")
         if source is not None:
-            if source.max_age_s is not None:  # else it speaks only when it changes
+            if source.max_age_s is not None:  # otherwise it publishes only changes
                 self._required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
             bumped = [
@@ -490,7 +492,7 @@ class Filling:
         self.signals["bumped"] = np.concatenate(bumped)
 
     def _nav_command(self) -> None:
-        """Return what navigation proposes; a tick at which that is unknown stays usable."""
+        """Set the command that navigation proposes; a tick without one stays usable."""
         count, name = len(self.tick_ns), "nav_command"
         unknown = np.full(count, np.nan)
         source = self.inputs.by_name.get(name)
@@ -540,7 +542,7 @@ class Filling:
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
 
     def _hindsight(self) -> None:
-        """Fill goals and routes from where the robot went; only these signals look ahead."""
+        """Set goals and routes in hindsight; only their signals depend on later messages."""
         xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
         at = np.flatnonzero(self.located)
         carried = np.zeros(len(self.tick_ns), np.bool_)
@@ -555,7 +557,7 @@ class Filling:
 
 
 def _chunks(steps: int) -> Iterator[Ints]:
-    """Yield the steps some at a time: what is made of scans takes memory."""
+    """Yield step indices in chunks, as intermediate arrays of scans take much memory."""
     for start in range(0, steps, _CHUNK):
         yield np.arange(start, min(start + _CHUNK, steps))
 
@@ -563,7 +565,10 @@ def _chunks(steps: int) -> Iterator[Ints]:
 def _with_earlier(
     signals: Signals, rows: Ints, before: Ints, count: int
 ) -> tuple[Signals, list[Signals]]:
-    """Return signals of these steps and of the `count` steps before each, the last one first."""
+    """Return the signals of steps `rows` (n,), and those of the `count` steps before, last first.
+
+    `before` (T,) is the index of the step before each step, or of the step itself if it is first.
+    """
     at = [rows]
     for _ in range(count):
         at.append(before[at[-1]])
@@ -572,7 +577,7 @@ def _with_earlier(
 
 
 def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
-    """Return whether the bumper was pressed since the tick before (or is), (T,)."""
+    """Return whether the bumper is pressed at each tick, or was since the tick before, (T,)."""
     if not len(bumper.row) or not len(tick_ns):
         return np.zeros(len(tick_ns), np.bool_)
     counts = np.concatenate([[0], np.cumsum(pressed[bumper.row])])
@@ -584,9 +589,10 @@ def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
 
 @lru_cache(maxsize=1024)
 def parse_policy(text: str) -> tuple[str, str | None, float | None]:
-    """Parse `{"policy": …, "version": …, "probability": …}`, or a bare name, into the three.
+    """Parse name, version and probability of a policy from JSON with these keys, or a bare name.
 
-    NaN is a probability that is none, as -3 is.
+    The keys are `policy`, `version` and `probability`. An invalid probability, such as -3, becomes
+    NaN.
     """
     try:
         message = json.loads(text)

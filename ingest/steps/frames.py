@@ -1,17 +1,17 @@
 """Poses from transforms (`/tf` and `/tf_static`), and speeds from poses.
 
-Every frame has one parent at a time. At a time each frame's transform is the latest at or before it
-(a causal hold, nothing is interpolated): from `/tf` at most `max_age_s` old, from `/tf_static`
-however old. A lookup goes up from both frames to their common ancestor. A transform may be stamped
-ahead of when it was sent (localisation does so, to keep it usable until the next one): it counts
-from when it was received.
+Every frame has one parent at a time. At a given time, a frame's transform is the latest at or
+before that time (a causal hold, without interpolation): from `/tf` at most `max_age_s` old, from
+`/tf_static` of any age. A lookup goes up from both frames to their common ancestor. A transform may
+be stamped later than it was sent, as localisation does to keep it usable until the next one. It is
+then timed by its reception.
 
 A robot without odometry gets its speed from its poses. A straight line is fitted to the poses of
-the last `window_s` up to the latest one at the tick, none later. Its slope is the motion in the
-middle of that window: a longer window removes more of the localiser's noise, and lags more. Poses
-that arrive together span too little time for a speed: the one before the window then belongs to it.
-A tick has no speed if its poses are too close in time, or if a jump is in its window: the robot
-cannot have driven so far, so the localiser found it elsewhere.
+the `window_s` that end with the latest pose at the tick. Its slope is the motion in the middle of
+the window: a longer window removes more of the localiser's noise, and lags more. If the poses in
+the window arrived together, they span too little time, and the pose before the window is added. A
+tick has no speed if its poses are too close in time, or if its window contains a jump: the robot
+cannot have driven so far, so the localiser corrected itself.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ PARENT = "parent"
 
 @dataclass(frozen=True)
 class Edges:
-    """The transforms of a recording, a topic a frame and source, for `align` to put in order."""
+    """The transforms of a recording, grouped by topic and child frame, as topics for `align`."""
 
-    topics: dict[str, TopicColumns]  # "/tf odom" -> the transforms whose child is odom
-    static: frozenset[str]  # of those topics, the ones that never age
+    topics: dict[str, TopicColumns]  # "/tf odom" -> the transforms in /tf whose child is odom
+    static: frozenset[str]  # names of those in `topics` that never age
     parents: dict[str, list[str]]  # frame -> every parent it ever has
-    parent_changes: int = 0  # times that a frame is given another parent
+    parent_changes: int = 0  # how often a frame is given another parent
 
     @classmethod
     def of(cls, frames: Frames, topics: Mapping[str, TopicColumns]) -> Edges:
@@ -65,14 +65,14 @@ class Edges:
         return cls(edges, frozenset(static), parents, changes)
 
     def only(self, frames: set[str]) -> Edges:
-        """Keep only the transforms that may lead up from these frames."""
+        """Keep only the transforms of these frames and of all frames above them."""
         reached = {up for frame in frames for up in upward(plain(frame), self.parents)}
         kept = {name: c for name, c in self.topics.items() if name.split(" ", 1)[1] in reached}
         parents = {frame: up for frame, up in self.parents.items() if frame in reached}
         return Edges(kept, self.static & kept.keys(), parents, self.parent_changes)
 
     def missing(self, base: str, fixed: str) -> str | None:
-        """Return why no transform of the recording leads from one frame to the other, or None."""
+        """Return why transforms never connect the two frames, or None if they do."""
         ways = [upward(plain(frame), self.parents) for frame in (base, fixed)]
         if ways[0] & ways[1]:
             return None
@@ -87,7 +87,7 @@ class Edges:
 
 
 def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
-    """Group a topic's transforms by the frame that they place."""
+    """Group a topic's transforms by child frame."""
     layout = transform_fields(topic.fields)
     assert layout is not None
     columns = [topic.fields[path] for path in layout]
@@ -120,8 +120,8 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
 
 
 def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
-    """Return which of the plain names, sorted, each of these frames (N,) has; and the names."""
-    place: dict[str, int] = {}  # of each name as it is written, in the order they are met
+    """Return the plain names of frames (N,), sorted, and each frame's index among them, (N,)."""
+    place: dict[str, int] = {}  # name as written -> its index, in order of appearance
     observed = [place.setdefault(name, len(place)) for name in frames.tolist()]
     each = [plain(name) for name in place]
     names = sorted(set(each))
@@ -130,7 +130,7 @@ def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
 
 
 def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
-    """Return a frame and all frames that are ever above it."""
+    """Return a frame and all frames that are ever its ancestors."""
     reached, open_ = set[str](), {frame}
     while open_:
         here = open_.pop()
@@ -145,12 +145,12 @@ class Placement:
 
     rotation: F64  # (T, 3, 3)
     translation_m: F64  # (T, 3)
-    stamp_ns: Ints  # (T,) of the newest moving transform on the way; the time itself if none moves
-    problem: NDArray[Any]  # (T,) why it is not known, or ""
+    stamp_ns: Ints  # (T,) of the newest moving transform used; if all are static, the time itself
+    problem: NDArray[Any]  # (T,) why the pose is unknown, or ""
 
     @classmethod
     def nowhere(cls, count: int) -> Placement:
-        """Return the fixed frame itself, until `fill` sets another pose."""
+        """Return `count` identity poses, to be set by `fill`."""
         return cls(
             np.tile(np.eye(3), (count, 1, 1)),
             np.zeros((count, 3)),
@@ -159,7 +159,7 @@ class Placement:
         )
 
     def fill(self, rows: Any, other: Placement, order: Any) -> None:
-        """Take these rows over, in this order, from another one."""
+        """Set `rows` to the rows `order` of another placement."""
         for to, source in zip(self._parts(), other._parts(), strict=True):
             to[rows] = source[order]
 
@@ -175,8 +175,8 @@ class Placement:
 class _Transform:
     """A frame's transform to its parent at T times."""
 
-    row: Ints  # (T,) of the edge's columns
-    parent: Ints  # (T,) number of the parent frame; -1 where no transform is known
+    row: Ints  # (T,) row of the edge's columns
+    parent: Ints  # (T,) number of the parent frame; -1 if no transform is known
     fresh: NDArray[np.bool_]
     moving: NDArray[np.bool_]
     stamp_ns: Ints
@@ -186,7 +186,7 @@ class _Transform:
 
 @dataclass
 class Tree:
-    """The frames of a recording in time."""
+    """The frames of a recording and their transforms over time."""
 
     frames: Frames
     edges: Edges
@@ -194,7 +194,7 @@ class Tree:
     _numbers: dict[str, int] = field(default_factory=dict)  # frame -> its number
 
     def place(self, frame: str, times: Sequence[Ints]) -> Placement:
-        """Return the pose of `frame` in the fixed frame at these times of each segment."""
+        """Return the pose of `frame` in the fixed frame at these times, given per segment."""
         source, fixed = self._number(frame), self._number(self.frames.fixed)
         count = sum(map(len, times))
         out = Placement.nowhere(count)
@@ -212,7 +212,7 @@ class Tree:
         return out
 
     def times(self, frame: str) -> list[Ints]:
-        """Return by segment when a moving transform between `frame` and the fixed one was given."""
+        """Return the stamps of moving transforms between `frame` and the fixed one, per segment."""
         topics = self.edges.only({frame, self.frames.fixed}).topics
         moving = [name for name in topics if name.split(" ", 1)[0] == self.frames.topic]
         return [
@@ -223,10 +223,9 @@ class Tree:
         ]
 
     def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
-        """Return the transforms from `frame` to the fixed frame at one time.
+        """Return the transforms between `frame` and the fixed frame at one time.
 
-        Each by its topic, the frame that it places, its row in `edges.topics["TOPIC FRAME"]` and
-        its stamp (ns).
+        Each as topic, child frame, row in `edges.topics["TOPIC FRAME"]` and stamp (ns).
         """
         transforms = self._hold_above(frame, time)
         parent = {
@@ -247,7 +246,7 @@ class Tree:
         ]
 
     def _hold_above(self, frame: str, times: Sequence[Ints]) -> dict[int, _Transform]:
-        """Hold the transforms of all frames above this one and the fixed one, by their numbers."""
+        """Return the transforms of this frame, the fixed frame and all above, by frame number."""
         children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
         return {self._number(child): self._hold(child, times) for child in children}
 
@@ -259,7 +258,7 @@ class Tree:
         up: list[int],
         other: list[int],
     ) -> None:
-        """Place the times `rows`, at which the ways to the top are `up` and `other`."""
+        """Set the poses at the times `rows`, when the paths to the root are `up` and `other`."""
         meet = next((frame for frame in up if frame in other), None)
         if meet is None:
             out.problem[rows] = self._apart(up, other)
@@ -281,7 +280,7 @@ class Tree:
     def _compose(
         self, out: Placement, rows: Ints, transforms: dict[int, _Transform], way: list[int]
     ) -> tuple[F64, F64]:
-        """Compose the transforms along a way: rotation (N, 3, 3) and translation (N, 3)."""
+        """Compose the transforms along a path: rotation (N, 3, 3) and translation (N, 3)."""
         rotation, translation = np.tile(np.eye(3), (len(rows), 1, 1)), np.zeros((len(rows), 3))
         for frame in way:
             one = transforms[frame]
@@ -299,7 +298,7 @@ class Tree:
         return f"no transform from {self._name(other[-1])} to {self._name(up[-1])} yet"
 
     def _hold(self, child: str, times: Sequence[Ints]) -> _Transform:
-        """Hold a frame's transform at these times: that of `/tf` if there is one, else static."""
+        """Return a frame's transform at these times: from `/tf` if there is one, else static."""
         moving = self._of(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
         still = self._of(f"{self.frames.static_topic} {child}", times, None)
         if moving is None or still is None:
@@ -345,7 +344,7 @@ class Tree:
 
 
 def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
-    """Return rotation matrices (N, 3, 3) of quaternions (N,); NaN for one without length."""
+    """Return rotation matrices (N, 3, 3) of quaternions (N,); NaN for a quaternion of length 0."""
     with np.errstate(all="ignore"):
         size = np.sqrt(x * x + y * y + z * z + w * w)
         x, y, z, w = (np.where(size > 1e-9, part / size, np.nan) for part in (x, y, z, w))
@@ -358,15 +357,15 @@ def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
 
 
 def _way(frame: int, parent: Mapping[int, int]) -> list[int]:
-    """Return the frames from this one up to the top; a loop ends where it closes."""
+    """Return the frames from this one up to the root; a loop ends before it repeats a frame."""
     way = [frame]
     while way[-1] in parent and parent[way[-1]] not in way:
         way.append(parent[way[-1]])
     return way
 
 
-SCATTER_M = 0.05  # between two poses: less is no jump
-_CHUNK = 4096  # ticks at a time: bounds memory
+SCATTER_M = 0.05  # margin for noise between two poses, before a step counts as a jump
+_CHUNK = 4096  # ticks processed at a time: bounds memory
 
 
 @dataclass(frozen=True)
@@ -380,14 +379,14 @@ class PoseSeries:
 
     @classmethod
     def of(cls, stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> PoseSeries:
-        """Keep the finite poses; of equal stamps the last."""
+        """Build a series of the finite poses; among equal stamps, the last is kept."""
         keep = np.isfinite(x_m) & np.isfinite(y_m) & np.isfinite(yaw_rad)
         keep[:-1] &= np.diff(stamp_ns) > 0
         return cls(stamp_ns[keep], x_m[keep], y_m[keep], yaw_rad[keep])
 
     @classmethod
     def joined(cls, parts: Sequence[PoseSeries]) -> PoseSeries:
-        """Join consecutive stretches."""
+        """Concatenate consecutive series."""
         return cls.of(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS)
         )
@@ -400,7 +399,7 @@ _COLUMNS = ("stamp_ns", "x_m", "y_m", "yaw_rad")
 
 
 def poses_along(tree: Tree) -> list[PoseSeries]:
-    """Return every pose of a tree's base in its fixed frame, by segment."""
+    """Return every pose of a tree's base in its fixed frame, per segment."""
     times = tree.times(tree.frames.base)
     at = tree.place(tree.frames.base, times)
     x, y = (np.where(at.problem == "", column, np.nan) for column in at.translation_m.T[:2])
@@ -411,12 +410,12 @@ def poses_along(tree: Tree) -> list[PoseSeries]:
 
 @dataclass(frozen=True)
 class Motion:
-    """Speeds at T ticks, in the body frame of the middle of each window."""
+    """Speeds at T ticks, in the body frame in the middle of each window."""
 
     forward_mps: F64
     lateral_mps: F64
     yaw_rate_radps: F64
-    problem: NDArray[Any]  # (T,) why there is none, or ""
+    problem: NDArray[Any]  # (T,) why the speed is unknown, or ""
 
 
 def motion_at(
@@ -426,10 +425,11 @@ def motion_at(
     max_jump_m: float,
     fastest_mps: float = math.inf,
 ) -> Motion:
-    """Compute the motion at ticks (T,) by the poses of the `window_s` before each one's latest.
+    """Compute the motion at ticks (T,) from the poses in the `window_s` up to the latest of each.
 
-    A step of more than `max_jump_m` is a jump, and so is one that a robot of `fastest_mps` does not
-    drive in the time of the step and a window more: stamps jitter, and it may be faster than asked.
+    A step between poses is a jump if it is longer than `max_jump_m`, or than a robot of
+    `fastest_mps` drives in the time of the step plus `window_s`. The extra time allows for jitter
+    of stamps, and for a robot that is faster than commanded.
     """
     count = len(tick_ns)
     out = Motion(np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, "", object))
@@ -449,7 +449,7 @@ def motion_at(
     reach_m = fastest_mps * (np.diff(poses.stamp_ns) * 1e-9 + window_s) + SCATTER_M
     steps_m = np.hypot(np.diff(poses.x_m), np.diff(poses.y_m))
     jumps = steps_m > np.minimum(reach_m, max_jump_m)
-    before = np.concatenate([[0], np.cumsum(jumps)])  # jumps up to each pose
+    before = np.concatenate([[0], np.cumsum(jumps)])  # number of jumps up to each pose
     jumped = ~few & (before[latest] > before[np.minimum(begin, len(poses) - 1)])
     out.problem[jumped] = f"a pose jump within {window_s:g} s"
     turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
@@ -462,7 +462,7 @@ def motion_at(
 
 
 def _fill(out: Motion, rows: Ints, poses: PoseSeries, heading: F64, begin: Ints, end: Ints) -> None:
-    """Fit the slopes of the poses from `begin` to before `end`, into these rows."""
+    """Fit the slopes of poses `begin` to `end` (exclusive), and write them to these rows."""
     most = int((end - begin).max())
     at = begin[:, None] + np.arange(most)  # (R, P)
     inside: Bools = at < end[:, None]

@@ -1,18 +1,18 @@
 """The inputs of a profile that a recording has, by name: their fields as columns.
 
-Positions are in the fixed frame, from the profile's `origin_m`: a pose by latitude and longitude is
-projected into it, and goals and plans that were given in another frame are put into it by their
-`Placement`.
+Positions are in the fixed frame, relative to the profile's `origin_m`. A pose by latitude and
+longitude is projected into that frame, and goals and plans in another frame are transformed by
+their `Placement`.
 
-Satellite fixes (NavSatFix, LocationFix) become metres east and north of an origin. Latitude,
-longitude and the origin go to earth-centred coordinates on the WGS84 ellipsoid (at height 0), and
-from there to the plane that touches it at the origin, x to the east and y to the north (REP 103;
-NIMA TR8350.2). Distances within 10 km of the origin are right to 5 mm at that height, and too
-short by height / 6,371 km above it: 8 cm per km at 500 m.
+Satellite fixes (NavSatFix, LocationFix) become metres east and north of an origin. Fixes and origin
+are converted to earth-centred coordinates on the WGS84 ellipsoid (at height 0), and projected to
+the plane that touches it at the origin, x to the east and y to the north (REP 103; NIMA TR8350.2).
+Distances within 10 km of the origin are right to 5 mm at that height, and too short by
+height / 6,371 km above it: 8 cm per km at 500 m.
 
-A fix has no heading. The heading is that of an IMU, if the profile names one, else the direction of
-the last `track_m` driven: computed from the past alone, held while the robot stands, and reversed
-when it backs up.
+A fix has no heading. The heading is that of an IMU, if the profile names one, and otherwise the
+direction of the last `track_m` driven. That direction depends only on the past, is held while the
+robot stands, and is reversed when the robot backs up.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from restock.ingest.steps.frames import Placement
 from restock.ingest.task.task import yaw_of
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS84
-COVARIANCES = 9  # of a fix
-MAX_STD_M = 5.0  # of a fix, where it says and the profile does not
-TRACK_M = 1.0
+COVARIANCES = 9  # entries of a fix's covariance matrix
+MAX_STD_M = 5.0  # default limit for a fix's reported standard deviation
+TRACK_M = 1.0  # default of `track_m`
 _BLOCK = 64
 NO_FIX, UNCERTAIN, NOT_DRIVEN, NO_HEADING = (
     *("no fix", "fix too uncertain", "heading unknown until the robot has driven"),
@@ -60,18 +60,18 @@ NO_FIX, UNCERTAIN, NOT_DRIVEN, NO_HEADING = (
 
 @dataclass(frozen=True)
 class Fixes:
-    """The fixes of one topic (N,), in the order of its messages, as they were recorded."""
+    """The fixes of one topic (N,), as recorded, in the order of its messages."""
 
-    time_ns: Ints  # log time: what came before is by it
+    time_ns: Ints  # log time, which orders the fixes
     latitude_deg: F64
     longitude_deg: F64
     status: F64 | None = None  # below 0: no fix (sensor_msgs/NavSatStatus)
-    covariance_m2: F64 | None = None  # (N, 9) of east, north and up
+    covariance_m2: F64 | None = None  # (N, 9) for east, north and up
     covariance_type: F64 | None = None  # 0: unknown
-    yaw_rad: F64 | None = None  # of an IMU at each; NaN: not known. None: by the track
+    yaw_rad: F64 | None = None  # IMU's yaw at each fix, NaN: unknown. None: use the track
 
     def std_m(self) -> F64:
-        """Return the standard deviation of east or north that each reports; NaN if it does not."""
+        """Return the larger standard deviation of east and north, (N,); NaN if not reported."""
         std = np.full(len(self.time_ns), np.nan)
         if self.covariance_m2 is not None:
             variance = self.covariance_m2[:, [0, 4]].max(axis=1)
@@ -86,7 +86,7 @@ class Fixes:
         problem = np.full(len(self.time_ns), "", object)
         problem[self.std_m() > max_std_m] = UNCERTAIN
         sane = (np.abs(self.latitude_deg) <= 90) & (np.abs(self.longitude_deg) <= 360)
-        sane &= (self.latitude_deg != 0) | (self.longitude_deg != 0)  # as receivers say: nothing
+        sane &= (self.latitude_deg != 0) | (self.longitude_deg != 0)  # 0, 0: no fix
         if self.status is not None:
             sane &= self.status >= 0
         problem[~sane] = NO_FIX
@@ -106,7 +106,7 @@ class Fixes:
         max_std_m: float | None = None,
         track_m: float | None = None,
     ) -> FixedPoses:
-        """Return their poses about the origin (None: the first of use)."""
+        """Convert the fixes to poses about an origin; None: the first usable fix."""
         max_std_m, track_m = max_std_m or MAX_STD_M, track_m or TRACK_M
         problem = self.problems(max_std_m)
         x, y, yaw = np.full((3, len(problem)), np.nan)
@@ -126,11 +126,11 @@ class Fixes:
 
 
 def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None = None) -> Fixes:
-    """Read a topic's fixes by the `fields` of the profile's input, with a heading at each."""
+    """Read a topic's fixes from the `fields` of the profile's input; `yaw` is Fixes.yaw_rad."""
     named = {}
     for key, path in fields.items():
         column = columns.fields.get(path)
-        if isinstance(column, Ragged) and key == "covariance_m2":  # no type fixes its length
+        if isinstance(column, Ragged) and key == "covariance_m2":  # lists may have any length
             reported = np.flatnonzero(column.lengths == COVARIANCES)
             rows = np.full((len(column), COVARIANCES), np.nan)
             rows[reported] = np.asarray(column.take(reported).values).reshape(-1, COVARIANCES)
@@ -144,12 +144,12 @@ def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None =
 
 @dataclass(frozen=True)
 class FixedPoses:
-    """Poses (N,) by fixes or dead reckoning; NaN if unknown (a position may have no yaw)."""
+    """Poses (N,) by fixes or dead reckoning; unknown values are NaN, possibly the yaw alone."""
 
     x_m: F64  # to the east
     y_m: F64  # to the north
     yaw_rad: F64  # from the east, counter-clockwise
-    problem: NDArray[Any]  # (N,) why there is none, or ""
+    problem: NDArray[Any]  # (N,) why the pose is unknown, or ""
 
 
 def local_plane_m(latitude_deg: F64, longitude_deg: F64, origin_deg: tuple[float, float]) -> F64:
@@ -166,7 +166,7 @@ def local_plane_m(latitude_deg: F64, longitude_deg: F64, origin_deg: tuple[float
 def _earth_centred_m(latitude_deg: F64, longitude_deg: F64) -> F64:
     """Return coordinates (N, 3) of points on the ellipsoid."""
     phi, lam = np.radians(latitude_deg), np.radians(longitude_deg)
-    squared = FLATTENING * (2 - FLATTENING)  # of the eccentricity
+    squared = FLATTENING * (2 - FLATTENING)  # square of the eccentricity
     across = EQUATOR_M / np.sqrt(1 - squared * np.sin(phi) ** 2)
     return np.stack(
         [
@@ -179,18 +179,19 @@ def _earth_centred_m(latitude_deg: F64, longitude_deg: F64) -> F64:
 
 
 def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
-    """Return the direction (N,) of the last `track_m` up to each position, in the order they came.
+    """Return the direction of the last `track_m` driven up to each position, (N,), in rad.
 
-    From the latest earlier position that is so far away; where the robot has not been so far from
-    where it is since, the direction before is held. NaN until it has driven so far.
+    It points from the latest earlier position at that distance. If the robot has stayed nearer
+    since the direction was last found, that direction is held. NaN until the robot has driven
+    `track_m`. Positions are in order of time.
     """
-    # A robot that stands for an hour leaves an hour of positions that are all near: of a block of
-    # them, each is looked at only if a corner of the box around them is far.
+    # A robot that stands for an hour leaves an hour of near positions. Positions are therefore
+    # searched block by block, and a block only if a corner of its bounding box is far enough.
     whole = len(x_m) // _BLOCK * _BLOCK
     boxes = [column[:whole].reshape(-1, _BLOCK) for column in (x_m, y_m)]
     (left, right), (low, high) = ((box.min(axis=1), box.max(axis=1)) for box in boxes)
     yaw = np.full(len(x_m), np.nan)
-    held, back = np.nan, 0  # nothing before `back` is looked at: it lies before the last turn
+    held, back = np.nan, 0  # `back` is the position that gave `held`; the search ends there
     for here, (x, y) in enumerate(zip(x_m, y_m, strict=True)):
         first, last = back // _BLOCK, here // _BLOCK
         at = slice(first, last)
@@ -210,10 +211,11 @@ def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
 
 
 def reckon(time_ns: Ints, rates: F64, max_gap_s: float) -> FixedPoses:
-    """Return the poses to which speed, speed to the left and yaw rate (3, N) lead, from zero.
+    """Integrate speed, speed to the left and yaw rate (3, N) to poses (N,), starting at zero.
 
-    Between two messages the robot has the mean of their rates; over more than `max_gap_s` it does
-    not move. Where a rate is not finite, all count as 0, and there is no pose.
+    Between two messages the robot moves at the mean of their rates; in gaps of more than
+    `max_gap_s` it does not move. If a rate of a message is not finite, all its rates count as 0,
+    and its pose is NaN.
     """
     order = np.argsort(time_ns, kind="stable")
     known = np.isfinite(rates[:, order]).all(axis=0)
@@ -236,23 +238,23 @@ class InputColumns:
 
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics, self.max_gap_s = topics, profile.clock.max_gap_s
-        self.origin_m = np.array(profile.origin_m or (0.0, 0.0))  # of all positions
-        self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
-        self.by_name: dict[str, Input] = {  # those whose topic the recording has
+        self.origin_m = np.array(profile.origin_m or (0.0, 0.0))  # origin of all positions
+        self.placed: dict[str, Placement] = {}  # inputs in another frame -> pose of it per message
+        self.by_name: dict[str, Input] = {  # inputs whose topic is in the recording
             name: source
             for name, source in profile.sources.items()
             if source.topic in topics and not (source.optional and not len(topics[source.topic]))
         }
 
     def column(self, name: str, key: str) -> FieldColumn:
-        """Return a field of an input as it was read."""
+        """Return a field of an input as it was decoded."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
         return fields[path] if place is None else said_in(fields, source.fields[key])
 
     def numbers(self, name: str, key: str) -> F64:
-        """Return a field of an input, one number a message (N,)."""
+        """Return a field of an input in the unit of its key, one number per message, (N,)."""
         if name == "pose" and key in ("x_m", "y_m"):
             return self._numbers(name, key) - float(self.origin_m["xy".index(key[0])])
         return self._numbers(name, key)
@@ -293,7 +295,7 @@ class InputColumns:
         return np.asarray(found, np.float64)
 
     def no_estimate(self, name: str, key: str) -> Bools:
-        """Return which messages (N,) report that they have no estimate of this field."""
+        """Return which messages (N,) are marked as without an estimate of this field."""
         source = self.by_name[name]
         columns = self.topics[source.topic]
         none = np.zeros(len(columns), np.bool_)
@@ -302,7 +304,7 @@ class InputColumns:
         return none
 
     def unestimated(self) -> Iterator[tuple[str, str, int, str]]:
-        """List inputs that have messages without an estimate: name, field, count, and how."""
+        """Yield inputs with messages without an estimate: name, field, count, and their marking."""
         for name, source in self.by_name.items():
             columns = self.topics[source.topic]
             rules = (rule for path in source.fields.values() for rule in _said_of(source, path))
@@ -311,12 +313,12 @@ class InputColumns:
                     yield name, rule.values[0], count, rule.words
 
     def texts(self, name: str) -> list[str]:
-        """Return the text of an input, one a message."""
+        """Return the text of each message of an input."""
         return [str(text) for text in np.asarray(self.column(name, "text"), object)]
 
     @cached_property
     def fixed(self) -> FixedPoses:
-        """Return the pose of each message whose position is by latitude and longitude."""
+        """Return the pose of each message of a pose by latitude and longitude."""
         source = self.by_name["pose"]
         columns, yaw = self.topics[source.topic], None
         if "heading" in self.by_name:
@@ -338,7 +340,7 @@ class InputColumns:
         return reckon(time_ns, np.stack([speed, aside, turn]), self.max_gap_s)
 
     def _heading_at(self, time_ns: Ints) -> F64:
-        """Return the heading (N,) received last at these log times; NaN if none is known."""
+        """Return the latest heading received at these log times, (N,); NaN if unknown or stale."""
         source = self.by_name["heading"]
         said_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
         order = np.argsort(said_ns, kind="stable")
@@ -351,7 +353,7 @@ class InputColumns:
 
     @cached_property
     def plans(self) -> list[F64]:
-        """Return each plan's points (P, 2); P is 0 if the planner found none."""
+        """Return the points (P, 2) of each plan; P is 0 if the planner found no plan."""
         x, y = self.column("plan", "x_m"), self.column("plan", "y_m")
         points = [
             np.stack([np.asarray(x[row], np.float64), np.asarray(y[row], np.float64)], axis=-1)
@@ -367,7 +369,7 @@ class InputColumns:
 
     @cached_property
     def goals(self) -> F64:
-        """Return each goal (G, 2)."""
+        """Return the goals (G, 2)."""
         goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
         if "goal" not in self.placed:
             return np.asarray(goals - self.origin_m)
@@ -376,7 +378,7 @@ class InputColumns:
         return np.asarray(turned + at.translation_m[:, :2] - self.origin_m)
 
     def frames_of(self, name: str) -> list[str]:
-        """Return the frame of each message of an input; empty if messages do not say."""
+        """Return the frame of each message of an input; empty if messages do not name one."""
         source = self.by_name.get(name)
         fields = {} if source is None else self.topics[source.topic].fields
         path = None if source is None else frame_path(source, fields)
@@ -387,7 +389,7 @@ class InputColumns:
         return [names[frame] for frame in frames]
 
     def _yaw(self, name: str) -> F64:
-        """Return the yaw (N,) of an input's quaternions; NaN without an estimate. See `yaw_of`."""
+        """Return the yaw of an input's quaternions by `yaw_of`, (N,); NaN without an estimate."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path = source.fields["orientation"]
@@ -397,9 +399,9 @@ class InputColumns:
 
 
 def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Reduction | None:
-    """Build the reduction that finds messages without an estimate of what these inputs take.
+    """Build the reduction that flags messages without an estimate of fields that inputs read.
 
-    None if messages with these fields never say so.
+    None if messages with these fields cannot be marked so.
     """
     rules = list(
         dict.fromkeys(
@@ -424,14 +426,14 @@ def _said_of(source: Input, path: str) -> list[Convention]:
 
 
 def _key(rule: Convention) -> str:
-    """Name a convention among its topic's columns; names of fields hold no space."""
+    """Return the column of a convention's flags; its name has spaces, unlike those of fields."""
     return f"no estimate of {rule.values[0]}"
 
 
 def _flags(columns: TopicColumns, rule: Convention) -> Bools:
-    """Return which messages say so, (N,); none if they lack the fields for it."""
+    """Return which messages a convention marks, (N,); all False if they lack its fields."""
     if _key(rule) in columns.fields:
         return np.asarray(columns.fields[_key(rule)], np.bool_)
-    if set(rule.fields) <= columns.fields.keys():  # whole, as no recording's reader gives them
+    if set(rule.fields) <= columns.fields.keys():  # whole messages, which readers reduce
         return rule.flags(columns.fields)
     return np.zeros(len(columns), np.bool_)

@@ -1,6 +1,6 @@
-"""Needs of a profile: the fields that it reads, and why a recording does not fit.
+"""The fields that a profile reads of a recording, and why a recording does not fit it.
 
-For a laser scan the clearance per sector is kept, not the ranges.
+Of a laser scan, only the clearance per sector is kept, not the ranges.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from restock.ingest.task.tracks import Lidar
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
 
-NEARLY = 0.8  # of a name's letters: /plan is not /scan
-MAX_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording
+NEARLY = 0.8  # similarity from which a topic may be a misspelling: /plan is not /scan
+MAX_TOLD = 20  # topics listed in an error, as a fleet's nightly ingest prints one per recording
 OTHER_FIELDS = (
     "correct the profile; if the messages changed with an update of the robot, ingest the "
     "recordings from before and after it with a profile each: a copy with the other field and "
@@ -61,13 +61,13 @@ def read_topics(
 ) -> dict[str, TopicColumns]:
     """Read the columns that a profile needs of a recording.
 
-    Where header stamps run at another pace than log time, `/clock` is read too: it says which.
-    `reduced`: scans as clearance, messages as custom signals and images as their layout alone,
-    which is all that steps are made of; else with all fields as they were recorded, but images, and
-    clouds as scans.
+    If header stamps run at another pace than log time, `/clock` is read too, as it gives the pace.
+    With `reduced`, scans become clearance, messages custom signals and images their layout, which
+    is all that steps need. Otherwise the needed fields are kept as recorded; but images are left
+    out, and clouds become scans.
 
     Raises:
-        RecordingError: as `wanted_fields`; a point cloud is in a frame that does not move along.
+        RecordingError: as `wanted_fields`; or a point cloud's frame does not move with the robot.
     """
     if not reduced:
         profile = msgspec.structs.replace(profile, cameras={})  # images do not fit into memory
@@ -100,7 +100,7 @@ def read_topics(
 
 
 def _told(profile: Profile, available: Mapping[str, Any]) -> str:
-    """List a recording's topics; of very many, only those that the profile could use."""
+    """List a recording's topics; if there are many, only those of types that the profile uses."""
     types = {source.type for source in profile.sources.values()}
     usable = [topic for topic in sorted(available) if available[topic].type in types]
     topics = sorted(available) if len(available) <= MAX_TOLD else usable[:MAX_TOLD]
@@ -110,10 +110,10 @@ def _told(profile: Profile, available: Mapping[str, Any]) -> str:
 
 
 def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
-    """Return the profile as it reads a recording with these topics.
+    """Return the profile for a recording with these topics: without lidar if it has no scans.
 
-    `available` is as in `wanted_fields`. It has no lidar if its scan is optional and no message of
-    it can be read, so that rows with and without clearance never share a task.
+    `available` is as in `wanted_fields`. The lidar is left out if its scan is optional and no
+    message can be read, so that rows with and without clearance never share a task.
     """
     scan = profile.inputs.scan
     if scan is None or not scan.optional:
@@ -128,13 +128,18 @@ def wanted_fields(
 ) -> dict[str, list[str]]:
     """Return topic -> field paths to keep for this profile, of the `available` topics.
 
-    `available` maps a topic to something with a `type`, an `expected` count and why it is `skipped`
-    if it is, `leaves` to every field of its messages. What `reductions` reads is not in it, unless
-    it is kept too. A topic that is skipped is in it: reading it counts its messages as lost.
+    Fields that only `reductions` read are not listed. Skipped topics are, as reading them counts
+    their messages as lost.
+
+    Args:
+        profile: the profile.
+        available: topic -> an object with its `type`, `expected` number of messages, and the reason
+            if the topic is `skipped`.
+        leaves: topic -> all fields of its messages.
 
     Raises:
-        RecordingError: a required topic is missing, cannot be decoded, holds another type than the
-            profile says, or its messages have no such field.
+        RecordingError: a required topic is missing, cannot be decoded or has another type than in
+            the profile, or its messages lack a field.
     """
     if problems := input_problems(profile, available, leaves):
         raise RecordingError(
@@ -176,9 +181,10 @@ def wanted_fields(
 def reductions(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> dict[str, Reduction]:
-    """Map each topic to the reduction of its messages as they are read.
+    """Return topic -> reduction of its messages as they are read.
 
-    Reductions make clearance, custom signals, images' layouts, and which messages have no estimate.
+    Reductions compute clearance, custom signals, layouts of images, and flags of messages without
+    an estimate.
     """
     parts: dict[str, list[Reduction]] = {}
     has = {topic: {leaf.path.removesuffix("[]") for leaf in some} for topic, some in leaves.items()}
@@ -235,7 +241,7 @@ def input_problems(
 ) -> list[str]:
     """Return why a recording with these topics (and fields) does not fit the profile, by topic."""
     needed: dict[str, list[str]] = {}
-    types: dict[str, str] = {}  # of what is needed
+    types: dict[str, str] = {}  # message type of each entry of `needed`
     wrong: dict[str, list[str]] = {}
     fields: list[str] = []
     sources: dict[str, Input | CustomSignal] = {**profile.sources}
@@ -273,10 +279,10 @@ def input_problems(
 
 
 def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
-    """Note optional inputs without their topic if an unused topic has their type.
+    """Return a note for each optional input whose topic is missing, if another topic may be it.
 
-    On one robot, or after an update, it may have another name. Plain texts and numbers may be
-    anything.
+    That is an unused topic of the same type: the name may differ on one robot, or after an update.
+    Types of std_msgs are not considered, as their messages may contain anything.
     """
     used = profile.topics
     found = []
@@ -290,9 +296,9 @@ def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
 
 
 def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> str:
-    """Ask about a topic that may be the missing one, or return "".
+    """Return a question that suggests another topic for a missing one, or "".
 
-    It is spelled nearly like it, or is the one of its type, `kind`, that is spelled most like it.
+    It suggests a topic that is spelled nearly the same, or the most similar topic of type `kind`.
     """
     if topic in available:
         return ""
@@ -304,7 +310,7 @@ def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> s
 
 
 def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Leaf]) -> list[str]:
-    """Describe the fields that an input's or signal's topic lacks, and those that it has."""
+    """Describe the fields that the topic of an input or signal lacks, and suggest others."""
     if isinstance(source, CustomSignal):
         problem = source.problem(leaves)
         return [f"`{name}.path`: {source.topic}: {problem}"] if problem else []
@@ -320,7 +326,7 @@ def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Le
 def _transform_problems(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> list[str]:
-    """Describe missing transforms if the pose is to come from them."""
+    """Describe why the transforms that a profile with [frames] needs are unusable."""
     pose, frames = profile.inputs.pose, profile.frames
     if frames is None:
         return []
@@ -342,19 +348,19 @@ def _transform_problems(
 
 
 def _skipped(topic: str, available: Mapping[str, Any]) -> str:
-    """Say that a topic is there, and why its messages cannot be decoded."""
+    """Describe why the messages of a topic cannot be decoded."""
     info = available[topic]
     return f"{topic} is skipped, with {counted(info.expected, 'message')}: {info.skipped}"
 
 
-MAX_TRANSFORMS = 500  # messages of a topic; what places a lidar is published all the time
+MAX_TRANSFORMS = 500  # messages searched per topic; a lidar's transform is published all the time
 
 
 def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
-    """Return a note for each lidar whose zero is taken to point ahead though nothing says so.
+    """Return a note for each lidar whose zero angle is assumed to point ahead, without evidence.
 
-    A profile says so by an angle other than 0, or by any angle in the lidar's own input. Transforms
-    say so if one places the frame of the scans; a recorded description may say it.
+    Evidence is an angle other than 0 in [task.body], any angle in the lidar's input, a transform
+    of the scans' frame, or a recorded robot description.
     """
     unsaid = {
         name: source
@@ -397,7 +403,7 @@ def _first_frame(recording: Recording, topic: str) -> str:
 
 
 def _children(recording: Recording, topic: str) -> Iterator[str]:
-    """Yield the frames that a topic of transforms places, again and again."""
+    """Yield the child frames of a topic of transforms; a frame may be yielded several times."""
     layout = transform_fields(recording.leaves(topic))
     if layout is None or recording.topics[topic].skipped:
         return
@@ -412,23 +418,23 @@ def _children(recording: Recording, topic: str) -> Iterator[str]:
             return
 
 
-# What is made of a scan, beside the message's own fields (whose names hold no space).
+# Columns computed from a scan. Their names have spaces, unlike names of the message's fields.
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
-FINE = "nearest return of each fine sector"  # (N, FINE_SECTORS) float64, m; if tracks are asked for
+FINE = "nearest return of each fine sector"  # (N, FINE_SECTORS) float64, m; if the task has tracks
 BEAMS = "number of beams"  # (N,) int64
 CLOSE = "whether a beam is too close to be measured"  # (N,) bool: -inf (REP 117)
-BLIND = "whether no beam has a valid range"  # (N,) bool; inf is one: nothing was hit
-UNAIMED = "whether its angles say where no beam points"  # (N,) bool
+BLIND = "whether no beam has a valid range"  # (N,) bool; inf is valid: nothing was hit
+UNAIMED = "whether its angles say where no beam points"  # (N,) bool: its angles are unusable
 
-_VALUES = 1 << 18  # ranges reduced at a time: what is in between stays in the processor's cache
-_MAPS = 64  # geometries that are remembered; a lidar has one
+_VALUES = 1 << 18  # ranges reduced at a time, so that intermediate arrays stay in the CPU's cache
+_MAPS = 64  # scan geometries that are cached; a lidar usually has one
 _TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
 def scan_reduction(task: Task, source: Input) -> Reduction:
     """Build the reduction of an input's scans to SECTORS, BEAMS, CLOSE, BLIND, UNAIMED and FINE.
 
-    Its `apply` raises RecordingError where an angle is not one number a message.
+    Its `apply` raises RecordingError if an angle is not one number per message.
     """
     reducer = _ScanReducer(task, source)
     if source.type == CLOUD:
@@ -438,15 +444,16 @@ def scan_reduction(task: Task, source: Input) -> Reduction:
 
 
 def angle_keys(fields: Mapping[str, str]) -> tuple[str, str]:
-    """Return the fields that define the angles of a scan's beams, as `beam_angles` takes them."""
+    """Return the keys of the fields with the angles of a scan's beams, for `beam_angles`."""
     last = "angle_max_rad" if "angle_max_rad" in fields else "angle_increment_rad"
     return "angle_min_rad", last
 
 
 def beam_angles(source: Input, first: F64, last: F64, beams: Ints) -> tuple[F64, F64]:
-    """Return the angle of the first beam and the step to the next, (N,), counter-clockwise.
+    """Return the angle of the first beam and the increment per beam, (N,) each.
 
-    As seen from above, either as the scans have them or by the angle of the last beam.
+    Both are counter-clockwise, seen from above. `last` is the scans' increment or the angle of the
+    last beam, as in `angle_keys`.
     """
     increment = last
     if "angle_max_rad" in source.fields:
@@ -455,7 +462,7 @@ def beam_angles(source: Input, first: F64, last: F64, beams: Ints) -> tuple[F64,
     return (-first, -increment) if source.upside_down else (first, increment)
 
 
-_Maps = tuple[SectorMap | MovedMap, Lidar | None]  # None: no tracks are asked for
+_Maps = tuple[SectorMap | MovedMap, Lidar | None]  # None: the task has no tracks
 
 
 class _ScanReducer:
@@ -478,7 +485,7 @@ class _ScanReducer:
         close, blind = np.zeros((2, len(beams)), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):
             angles = np.maximum(np.abs(first), np.abs(first + increment * (beams - 1)))
-        unaimed = (beams > 0) & ~(angles <= _TURNS_RAD)  # so is NaN
+        unaimed = (beams > 0) & ~(angles <= _TURNS_RAD)  # true for NaN, too
         unaimed |= (beams > 1) & (increment == 0)
         geometry = np.stack([first, increment, np.where(unaimed, 0, beams)], axis=1)
         if len(geometry) and (geometry == geometry[0]).all():
@@ -507,7 +514,7 @@ class _ScanReducer:
         rows: NDArray[np.intp] | None,
         geometry: NDArray[np.float64],
     ) -> None:
-        """Write what is made of these rows (None: of all), which have one geometry."""
+        """Write the columns of the scans `rows` (None: all), which share one geometry."""
         first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
         if not beams:
             return
