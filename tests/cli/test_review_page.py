@@ -184,7 +184,7 @@ def test_a_killed_server_loses_nothing(browser, store):
     with (store / NAME).open("ab") as journal:
         journal.write(b'{"kind": "verdict", "id": "ha')  # a write that a crash cut short
     press(tab, "y")
-    assert "The server does not answer: nothing was taken" in tab.text("#said")
+    assert "The server does not answer: nothing was saved" in tab.text("#said")
     tab.close()
     with ServedReview(store) as again:
         tab = opened(browser, again.address)

@@ -40,9 +40,9 @@ class McpCommand:
     """
 
     place: Annotated[str, Positional("PLACE")]
-    """What the questions are about."""
+    """The store, run, panel, recording or folder of recordings."""
     rows: int = 200
-    """How many rows of a query, or entries of a list, an answer has at most."""
+    """The largest number of rows of a query, or of entries of a list, in an answer."""
     seconds: float = 60.0
     """How long an answer may take."""
 
@@ -62,7 +62,7 @@ class McpCommand:
         )
         served = MCPServer(
             "restock",
-            instructions=f"Robot logs at {self.place}: `FROM columns` lists what SQL can ask.",
+            instructions=f"Robot logs at {self.place}: `FROM columns` lists what SQL can query.",
             log_level="WARNING",
         )
         hints = ToolAnnotations(read_only_hint=True)
@@ -131,8 +131,8 @@ class _Questions:
     def trace(self, row: str = "") -> dict[str, Any]:
         """Trace a row to its recording, the time in it, and its topics.
 
-        Of a store, `row` is a transition id; of a panel a row number; of a run STEP/ROW. Without
-        it, list the rows that are worth a look: the strangest, or those of the largest TD error.
+        `row` is a transition id of a store, a row number of a panel, or STEP/ROW of a run. Without
+        it, list rows that are worth a look: the strangest, or those with the largest TD errors.
         """
         if row and not _ROW.fullmatch(row):
             raise QueryError(f"{row!r} is not a row", where="row", remedy="give digits, or 1200/17")
@@ -142,7 +142,7 @@ class _Questions:
     def diagnose(self, twin: bool = False) -> dict[str, Any]:
         """Tell whether a run's critic fails because of its buffer or because of its target.
 
-        Of a store or a panel, tell whether its rows are at fault. With `twin`, also compare them
+        For a store or a panel, tell whether its rows are at fault. With `twin`, also compare them
         with rows of the twin, which takes longer.
         """
         found = self._answer("diagnose", self.place, *([] if twin else ["--no-twin"]))

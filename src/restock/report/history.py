@@ -70,7 +70,7 @@ def history_page(folder: Path) -> dict[str, Any]:
         "kicker": "runs and weeks",
         "title": folder.resolve().name,
         "headline": headline,
-        "lead": "Runs are in the order in which they began, each beside the run before it.",
+        "lead": "Runs are in order of their start; each is compared with the run before it.",
         "sections": [
             _runs(runs),
             _changes(runs, changes),
@@ -190,10 +190,10 @@ def _runs(runs: Sequence[_Seen]) -> Section | None:
     return Section(
         "runs",
         "Which runs, and how well do they drive?",
-        intro="Fed: shares of all rows that the critic was fed. Success by condition with 95 %"
-        " Wilson intervals, unperturbed: of `restock eval` if there is one, else of the last"
-        " evaluation in training. Runs may have driven other missions: the table below counts only"
-        " those that both of a pair drove.",
+        intro="Fed: shares of all rows that the critic was fed. Success by condition without a"
+        " perturbation, with 95 % Wilson intervals, from `restock eval` or else from the last"
+        " evaluation in training. Runs may have driven different missions; the table below counts"
+        " only missions that both runs of a pair drove.",
         tables=[_even(table)],
     )
 
@@ -221,9 +221,9 @@ def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
     return Section(
         "changed",
         "What changed from run to run?",
-        intro="Each run beside the one before it: settings, rows of the panel, and conditions"
-        " whose success differs by the 95 % interval over the missions that both drove. Another"
-        " training seed may change as much.",
+        intro="Each run is compared with the run before it: settings, rows of the panel, and"
+        " conditions in which success differs by the 95 % interval over the missions that both"
+        " drove. Another training seed may change success as much.",
         tables=[Table(table)],
     )
 

@@ -317,8 +317,8 @@ def _summary(findings: list[Finding]) -> str:
     ]
     skipped = [finding.audit.place for finding in findings if finding.status == "skipped"]
     if skipped:
-        flags = " and ".join(f"--{place}" for place in sorted({place or "" for place in skipped}))
-        counts.append(f"{len(skipped)} skipped ({flags} would run them)")
+        places = " and ".join(f"a {place}" for place in sorted({place or "" for place in skipped}))
+        counts.append(f"{len(skipped)} skipped (they need {places})")
     return ", ".join(counts)
 
 

@@ -435,6 +435,6 @@ def check_store(path: str) -> list[Finding]:
         ]
         if changed := len(store.changed_by_others):
             what = f"not used: another tool may have changed {counted(changed, 'recording')}"
-            remedy = f"rows are counted instead: `restock store compact {quoted(path)}` makes new"
+            remedy = f"rows are counted: `restock store compact {quoted(path)}` makes new summaries"
             found.append(Finding("store", "summaries", "ok", what, remedy))
         return found

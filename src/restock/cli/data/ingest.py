@@ -54,10 +54,10 @@ class IngestCommand:
     salvage: bool = False
     """Also read what is intact in damaged or truncated files (exit code 3)."""
     repeated: Literal["keep", "refuse", "replace"] = "keep"
-    """What to do with a recording whose rows are mostly those of another one in the store (a part
-    of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps` then
-    fails), refuse it, or replace: what is a part of it leaves the store, and it is refused if the
-    store holds as much or more of it."""
+    """What to do with a recording that mostly repeats another one in the store (a part of it, a
+    copy, a drive recorded again): keep it and say so (the audit `repeated_steps` then fails),
+    refuse it, or replace: recordings that are a part of it are removed from the store, and it is
+    refused if the store holds as much or more of the drive."""
     tag: Annotated[tuple[str, ...], Repeated("KEY=VALUE")] = ()
     """A tag for the recordings: robot, site, firmware, map, shift, or any other name. It overrides
     tags from the recording or its path; KEY= removes a tag. May be given several times."""
@@ -65,12 +65,12 @@ class IngestCommand:
     """Message definitions for recordings without their own: a ROS distribution (default: humble),
     or a folder (PACKAGE/msg/NAME.msg or .idl) or file that defines a robot's own types."""
     verbose: bool = False
-    """Print of many recordings what is printed of one: topics, signals, labels, what was dropped
-    and why. By default that is a line each, and a total."""
+    """Print the details of each recording: topics, signals, labels, what was dropped and why.
+    Several recordings otherwise get a line each, and a total."""
     watch: tuple[str, ...] | None = None
-    """Go on until it is interrupted, and take each recording that arrives in the folders once it is
-    complete; then print coverage and audits, a line of log an event. A COMMAND after it, in quotes,
-    is run after new recordings, with what is new as JSON on its standard input. Put it last."""
+    """Keep running, and ingest each recording that arrives in the folders once it is complete; then
+    print coverage and audits, with a line of log per event. A quoted COMMAND after --watch is run
+    after new recordings, with a JSON document about them on its standard input. Put it last."""
     workers: int = 1
     """How many processes read recordings at the same time."""
     json: bool = False
@@ -248,7 +248,7 @@ def show(outcome: IngestResult) -> None:
                     "from": f"{signal['topic']} {signal['path']}",
                     "messages": signal["messages"],
                     "with a value": signal["found"],
-                    "ticks that know it": signal["steps"],
+                    "ticks with a value": signal["steps"],
                 }
                 for signal in row["signals"]
             ]

@@ -38,7 +38,7 @@ class MixCommand:
     """
 
     store: Annotated[str, Positional("STORE")]
-    """The store to take transitions from, or a Parquet file of any task's (docs/panel.md)."""
+    """The store to take rows from, or a Parquet file with rows of any task (docs/panel.md)."""
     mixture: Annotated[str, Option("NAME|FILE")] = "coverage"
     """A TOML file, or one of coverage and uniform. See docs/mixture.md."""
     out: Annotated[Path | None, Option("PANEL")] = None
@@ -176,7 +176,7 @@ def _in_training(document: dict[str, Any], most: float) -> list[str]:
     if short:
         lines.append(
             f"warning: at the default training budget ({updates:,} updates of {batch_size:,} rows),"
-            f" logged rows can give less of a batch than is asked of the logs: {', '.join(short)};"
+            f" logged rows cannot fill their share of a batch: {', '.join(short)};"
             " the twin's fresh rows fill the rest of each quota, and a learner without a twin falls"
             " short (`restock train --dry-run`)"
         )
@@ -189,12 +189,12 @@ def _summary(document: dict[str, Any]) -> list[str]:
         f"{line['stratum']}: {line['note']}{_missing(line)}" for line in strata if line["note"]
     ]
     if any(line["missing_rows"] for line in strata):
-        lines.append("`restock coverage gaps` says how much driving that takes")
+        lines.append("`restock coverage gaps` shows how much driving that takes")
     if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
         lines.append(
             f"logged rows fill {document['logs_share']:.1%} of a batch, not"
-            f" {document['logs_share_wanted']:.1%} ([sources]): there are not enough; shares "
-            "drawn are of the rows that fill it"
+            f" {document['logs_share_wanted']:.1%} ([sources]): there are not enough; drawn shares"
+            " are of the logged rows drawn"
         )
     for fit in document["density_ratios"]:
         lines.append(

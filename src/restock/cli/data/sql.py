@@ -21,7 +21,7 @@ CUT_TO = 4  # values shown of a list that has more than twice as many, in a reco
 RECORDS = r"\G"  # ends a query instead of a semicolon, as in MySQL
 HELP = r"""End a query with ";", or with "\G" to see each row as a record.
   .tables          the tables and views
-  FROM columns;    every column of theirs
+  FROM columns;    their columns, with meanings
   Ctrl-C stops a query; Ctrl-D or .quit ends."""
 _TABLES = 'SELECT "view", count(*) AS columns FROM columns GROUP BY ALL ORDER BY ALL'
 

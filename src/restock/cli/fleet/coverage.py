@@ -122,9 +122,9 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
 
 
 _MEANING = {
-    "hours": "hours: driving like that logged so far, until one gap is closed: median (95 %)",
-    "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
-    " --unit hours counts driving as logged, nothing chosen",
+    "hours": "hours: of driving as logged so far, until one gap is closed: median (95 %)",
+    "missions": "missions: of the best kind, until one gap is closed: median (95 %)."
+    " --unit hours counts hours of driving as logged, without choosing missions",
 }
 
 
@@ -136,7 +136,7 @@ class GapsCommand:
         restock coverage gaps store/ --mixture my.toml --missions-out next.toml
         restock coverage gaps store/ --min-rows 20
 
-    A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
+    A gap is something that a mixture or an audit of coverage requires and that the store lacks:
     rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
     also cells of condition x zone x action (x robot). Each gap is printed with the rate seen so
     far, and the number of missions (or hours of driving) needed at that rate, with its 95 %
@@ -153,7 +153,7 @@ class GapsCommand:
     """A TOML file with thresholds of audits that replace the shipped ones, as for `restock
     audit`; `none`: use only the needs of the mixture, not those of the audits."""
     min_rows: Annotated[int, Option("N")] = 0
-    """Also ask for at least this many rows of every cell."""
+    """Also require at least this many rows of every cell."""
     unit: Literal["missions", "hours"] | None = None
     """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
@@ -228,7 +228,7 @@ def _print_gaps(answer: dict[str, Any]) -> None:
     unit = answer["unit"]
     name = f"{answer['store']} version {answer['store_version']}"
     if answer["closed"]:
-        output.print_text(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
+        output.print_text(f"{name}: no gaps; it has all that {answer['mixture']} requires")
         return
     known, unknown, orders = readable(answer)
     if known:

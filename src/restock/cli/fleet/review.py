@@ -23,13 +23,13 @@ NONE = "none"  # given instead of a file: removes all corrections
 class ReviewCommand:
     """Look at labels one by one, and say whether they are right.
 
-    Serves a page on this machine only, and prints its address: the way driven, the plan, the scan,
-    speeds and clearance around each event, and what the rule saw. Each verdict is on the disk
-    (STORE/review.jsonl) as soon as its key is pressed. Ctrl-C, or the page's button, writes them
-    into the store, where the labels get a version of their own.
+    Serves a page on this machine only, and prints its address. The page shows the path driven, the
+    plan, the scan, speeds and clearance around each event, and what the rule saw. Each verdict is
+    on disk (STORE/review.jsonl) as soon as its key is pressed. Ctrl-C, or the page's button, writes
+    the verdicts into the store, where the labels get a version of their own.
 
-    With --out, it writes a spreadsheet instead, with a column for verdicts, which FILE takes back.
-    See docs/ingest.md.
+    With --out, it writes a CSV file with a column for verdicts instead. Once filled in, give it as
+    FILE. See docs/ingest.md.
     """
 
     store: Annotated[Path, Positional()]
@@ -41,8 +41,8 @@ class ReviewCommand:
     dry_run: bool = False
     """With FILE: do everything except writing, and print what would change."""
     json: bool = False
-    """Print one JSON document: {"version", "verdicts", "recordings": [{"recording_id", …}]}; of a
-    page its {"address"}, of a new file {"file"}."""
+    """Print one JSON document: {"version", "verdicts", "recordings": [{"recording_id", …}]}; for a
+    page {"address"}, with --out {"file"}."""
 
     def run(self) -> int:
         """Serve the page, write a file of events, or read a file of verdicts."""

@@ -75,8 +75,8 @@ class CompactCommand:
         if done.summaries:
             get = "would get" if self.dry_run else "got"
             output.say(
-                f"{counted(done.summaries, 'recording')} {get} a summary, having none for their "
-                "present rows"
+                f"{counted(done.summaries, 'recording')} {get} a summary, as they had none for "
+                "their present rows"
             )
         if done.changed_meanwhile:
             output.say(
@@ -192,7 +192,7 @@ class RemoveCommand:
         lines.append(f"to get {it} back: restock ingest {' '.join(paths)} --store {store}")
         if corrections := sum(one.corrections for one in done.recordings):
             what = f"{counted(corrections, 'correction')} of labels"
-            lines.append(f"that does not bring back {what}, which were kept in the store alone")
+            lines.append(f"that does not bring back {what}, which only the store had")
         tags = sorted({f"{k}={v}" for one in done.recordings for k, v in one.tags.items()})
         had = f" (tags were {', '.join(tags)})" if tags else ""
         lines.append(f"give the options from before again, such as --profile or --tag{had}")
@@ -211,10 +211,10 @@ class VerifyCommand:
         restock store verify panel/
 
     `mix`, `export`, `audit`, `coverage gaps` and `info` do this first, but skip a file that was
-    found whole before if its size and time are the same. This reads all of them again. `sql` and
-    the rest of `coverage` only say how many files nobody has verified.
+    found whole before if its size and time are the same. This command reads all files again. `sql`
+    and the rest of `coverage` only say how many files have not been verified.
 
-    Exit codes: 0 all are whole, 1 a file is damaged or missing (of a panel: 2).
+    Exit codes: 0 all are whole, 1 a file is damaged or missing (2 for a panel).
     """
 
     store: Annotated[str, Positional("STORE")]

@@ -25,7 +25,7 @@ class DiagnoseCommand:
     the evidence and an experiment that would confirm it. The figures are from the last three
     evaluations; most of the runs must agree. Faulty rows in the panel change HEALTHY to BUFFER.
 
-    Of a panel or a store, before training, the rows of each robot and recording are compared with
+    For a panel or a store, before training, it compares the rows of each robot and recording with
     fresh rows from the twin and with the task's definitions. Do the actions explain the motion? Do
     rewards and episode ends follow the task? Do the rows follow from one another? Do goals come
     nearer, and are the racks where the twin has them? This finds systematic errors that no figure
@@ -38,14 +38,14 @@ class DiagnoseCommand:
     """Runs of one method (seeds); or one panel or store, whose rows are diagnosed, and the floors
     that the twin drives on, as for env.layouts (FLOOR.toml, map.yaml, generated:train)."""
     profile: str | None = None
-    """Of a panel or store: the profile with which the rows were ingested. Default: the one stored
+    """For a panel or store: the profile with which the rows were ingested. Default: the one stored
     with them."""
     perturbation: Path | None = None
-    """Of a panel or store: a perturbation that calibrates the twin, e.g. written by `restock twin
+    """For a panel or store: a perturbation that calibrates the twin, e.g. written by `restock twin
     fit`."""
     twin: bool = True
-    """Do not compare rows with the twin, which takes some seconds: those of a run's panel are not
-    diagnosed; those of a panel or store are checked only against the task's definitions."""
+    """Do not compare rows with the twin, which takes some seconds. The rows of a run's panel are
+    then not diagnosed; rows of a panel or store are checked only against the task's definitions."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None

@@ -29,8 +29,8 @@ _DRIVES = ("episodes", "perturbations", "policies", "seed", "layouts", "limiter"
 class EvalCommand:
     """Evaluate a run's policy on fixed episodes, beside scripted policies and a random one.
 
-    It is the best by the evaluations in training. If a run was interrupted before it evaluated what
-    it learned in the twin, it is the latest. The output names its step.
+    The policy is the best one in the evaluations during training, or the latest one if the run was
+    interrupted before it evaluated what it learned in the twin. The output names its step.
 
     Every policy drives the same seeded episodes of every condition for which the floors have room,
     without a perturbation and under each one. Prints success, return, bumps per kilometre, the

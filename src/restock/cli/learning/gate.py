@@ -32,7 +32,7 @@ class GateCommand:
     baseline: Annotated[str, Option("planner|RUN|FILE.onnx")]
     """What drives today: planner, operator, random, cloned, another run, or an exported policy."""
     margins: Annotated[str, Option("NAME=X,...")] = "success=0.05"
-    """By how much the policy may be worse, for each measure that is asked: success (a share),
+    """By how much the policy may be worse, for each measure to test: success (a share),
     bumps_per_km, closest_person_m, stopped_s (with --limiter) and time_lost_s."""
     conditions: str = ""
     """Comma-separated kinds of missions. Default: those that the run was trained on."""

@@ -21,8 +21,8 @@ class ReportCommand:
     the logs' positions and the agent's failures, and the provenance of the data.
 
     A gap between twin and logs that `restock twin gap` wrote to RUN/gap, or to the folder `gap` of
-    the panel's store, is shown in a section. For a FOLDER, the page shows the runs in it in the
-    order in which they began, what changed from each to the next, and its stores week by week.
+    the panel's store, is shown in a section. For a FOLDER, the page shows its runs in order of
+    their start, what changed from each run to the next, and its stores week by week.
 
     With --card, it writes the replay card instead: what the critic was fed, on one page of
     Markdown, to stdout, RUN/replay_card.md and RUN/replay_card.json.

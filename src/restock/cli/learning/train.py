@@ -257,7 +257,7 @@ def describe_run(prepared: Prepared) -> str:
         lines.append(_teacher(config.teacher, panel))
     elif config.teacher.source == PLANNER:
         lines.append(
-            "teacher planner: the policy does what navigation proposes, except where Q is more than"
+            "teacher planner: the policy does what navigation proposes, unless Q is more than"
             f" {config.teacher.margin:g} better for another action"
         )
     if config.evaluation.off_policy and (panel is None or not panel.splits):
@@ -342,12 +342,13 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
             f", and {others:,} rows of episodes in which other drivers alone reached the goal,"
         )
         rows += others
-    first = f"{cloned_rows} are cloned first"
-    mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
+    first = "no logged rows to clone: all actions are plausible at first"
+    if rows:
+        first = f"{cloned_rows} are cloned first"
+    mirrored = "; half of the teacher's rows are mirrored left to right" if teacher.mirror else ""
     return (
         f"teacher {teacher.source}: the policy chooses by Q among the actions that it finds"
-        " plausible; "
-        + ((first if rows else "no logged rows to clone: at first all actions are") + mirrored)
+        f" plausible; {first}{mirrored}"
     )
 
 

@@ -60,8 +60,8 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         "title": f"Coverage of {gaps['store']}",
         "headline": headline(shelves, gaps),
         "lead": f"{listed([counted(n, noun) for noun, n in counts.items()])}: how much of each "
-        f"condition they hold, and what mixture {gaps['mixture']} and the audits require and do not"
-        " find.",
+        f"condition they hold, and what they lack of the requirements of mixture {gaps['mixture']}"
+        " and the audits.",
         "sections": [
             _shelves(shelves, _once(store)),
             shopping_section(gaps),
@@ -91,7 +91,7 @@ def _once(store: Store) -> str:
 def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     """Name the largest gap, the conditions never seen, and what it takes to fill all gaps."""
     if gaps["closed"]:
-        return f"No gaps: the store has all that {gaps['mixture']} asks for"
+        return f"No gaps: the store has all that {gaps['mixture']} requires"
     short = [gap for gap in gaps["gaps"] if gap["needed"]]
     shelves_short = [gap for gap in short if gap["action"] is None] or short
     worst = min(shelves_short, key=lambda gap: gap["there"] / gap["needed"], default=None)
@@ -176,9 +176,9 @@ def _strangest(store: Store, place: str) -> Section | None:
     return Section(
         "strangest",
         "What does no rule name?",
-        intro=f"{explain_novel_rows(novel)} These are the strangest, one an episode, with"
-        " the entries of the observation that are furthest from the nearest rows (their mean)."
-        f" `restock trace {quoted(place)} ROW` follows one to its recording.",
+        intro=f"{explain_novel_rows(novel)} These are the strangest, one per episode, with the"
+        " entries of the observation that are furthest from the mean of the nearest rows."
+        f" `restock trace {quoted(place)} ROW` follows a row to its recording.",
         tables=[Table(shown)],
     )
 
@@ -299,7 +299,7 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
     if orders and unit == "missions":  # the twin drives no hours
         intro.append("`restock coverage gaps --missions-out FILE` writes it as missions to drive.")
     if unknown:
-        intro.append("What was never logged has no rate, so no amount to fill it is known.")
+        intro.append("What was never logged has no rate, so the amount needed is not known.")
     return Section(
         "shopping",
         "What to log next",

@@ -57,7 +57,7 @@
     const answer = await fetch(path, body === undefined ? {} : {
       method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body),
     }).catch(() => {
-      throw new Error("The server does not answer: nothing was taken. Run `restock review` again.");
+      throw new Error("The server does not answer: nothing was saved. Run `restock review` again.");
     });
     const document_ = await answer.json().catch(() => ({ error: `error ${answer.status}` }));
     if (!answer.ok) throw new Error(document_.error);
@@ -266,7 +266,7 @@
       await give([back, ...again]);
       given.pop();
       given.pop();
-      say("Taken back.");
+      say("Undone.");
       show(events.find((e) => e.event === first.event) ?? here);
     } catch (error) {
       say(error.message, "bad");

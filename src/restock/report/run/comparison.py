@@ -134,8 +134,8 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
     bands = (
         f"Bands are 95 % over up to {most} seeds (Student's t)."
         if any(row["low"] is not None for row in rows)
-        else f"There is no band from fewer than {MIN_PAIRS} seeds, and none where all came to"
-        " the same; another seed would give another curve."
+        else f"There is no band with fewer than {MIN_PAIRS} seeds, or if all seeds gave the same"
+        " value; another seed would give another curve."
     )
     return Section(
         "curves",
@@ -356,9 +356,9 @@ def _arms(arms: Rows, order: list[str], costs: dict[str, str]) -> Section | None
         "arms",
         "Success and safety at the end",
         intro="The kept policies on the unperturbed episodes, means with 95 % intervals over "
-        "seeds; safety in the rare missions. Time lost is against the planner, where both "
-        f"arrived. From fewer than {MIN_PAIRS} seeds, and where all came to the same, there are "
-        "values alone.",
+        "seeds; safety in the rare missions. Time lost is against the planner, over the missions "
+        f"that both completed. With fewer than {MIN_PAIRS} seeds, or if all gave the same value, "
+        "there is no interval.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         tables=[Table(rows)],
     )

@@ -237,7 +237,7 @@ def evaluation_bias(facts: Facts) -> str:
     gain = (evaluated - logged[worst]) * (success[worst] - as_logged)
     more = evaluated > logged[worst]
     text = (
-        "Evaluation against deployment: weighted as the logs' episodes met the conditions, success"
+        "Evaluation against deployment: weighted by the conditions of the logs' episodes, success"
         f" would be {as_logged:.0%} instead of {as_evaluated:.0%}, the mean over conditions."
     )
     if gain <= 0.0005:

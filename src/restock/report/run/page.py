@@ -66,9 +66,9 @@ def success(facts: Facts) -> Section | None:
         _measures(
             [row for row in cells if row["perturbation"] == name and row["policy"] != "random"],
             "Success, return and safety side by side" + ("" if name == "clean" else f": {name}"),
-            "Intervals are 95 % over episodes. People include forklifts; the distance is "
-            "the true one from the edge of the body. Time lost to the planner is over the missions "
-            "in which both arrived."
+            "Intervals are 95 % over episodes. People include forklifts; the distance to them is "
+            "the true one between the edges of the bodies. Time lost to the planner is over the "
+            "missions that both completed."
             if name == "clean"
             else "",
             folded=name != "clean",
@@ -186,7 +186,7 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
     within = RULES[name].doc if name in RULES else name
     cap = mixture.get("max_replays_per_row")
     most = f", a row at most {cap:g} times" if cap else ""
-    return f"quotas by stratum, within one {within}{most}"
+    return f"quotas by stratum, within a stratum {within}{most}"
 
 
 def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
@@ -195,7 +195,7 @@ def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
         return None
     rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
     by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
-    return "quotas by stratum, each of its rows alike" if by_quota else "uniform over the ring"
+    return "quotas by stratum, within a stratum uniform" if by_quota else "uniform over the ring"
 
 
 def _drawn_share(facts: Facts, source: str) -> float | None:
@@ -393,9 +393,9 @@ def films_section(facts: Facts) -> Section | None:
         "What does it look like?",
         intro="Episodes of the evaluation, driven again with the same spec, policy and outcome. "
         "For each condition: the failure with the lowest return, and an episode in which the "
-        "agent succeeded and another policy did not; the film shows that one to its left. Seen "
-        "from above: the robot is orange, its path a line, its plan dashed, the goal green; people "
-        "are blue, forklifts yellow, pallets brown, slippery floor light blue.",
+        "agent succeeded and another policy did not; that film shows the other policy on the left. "
+        "Seen from above: the robot is orange, its path a line, its plan dashed, the goal green; "
+        "people are blue, forklifts yellow, pallets brown, slippery floor light blue.",
         figures=figures,
         two=True,
     )
