@@ -1,1 +1,1 @@
-"""People's review of labels: events in doubt, what is shown of each, and their verdicts."""
+"""Review of labels by people: doubtful events, data to show for each, and verdicts."""

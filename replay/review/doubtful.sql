@@ -1,7 +1,7 @@
--- Events of labels, and stretches that may be missed ones, the most doubtful first.
--- `margin`: log odds that the label is right. Where the condition has a probability, those of the
--- rows, in the mean: below zero they speak against the label. Elsewhere the doublings of one step
--- that it is long: short events are wrong more often.
+-- Labelled events, and sequences of steps that may be missed events, most doubtful first.
+-- `margin` is large if the label is likely right. If the condition has a probability, it is the mean log
+-- odds of the rows that the label (or its absence) is right: a negative value contradicts it. Else it is
+-- log2 of the number of steps, because short events are wrong more often.
 WITH rules AS (
     SELECT
         ingest_id,
@@ -26,7 +26,7 @@ WITH rules AS (
         ON c.recording_id = t.recording_id
         AND c.condition = r.condition
         AND t.logged_ns BETWEEN c.first_ns AND c.last_ns
-    WHERE c.condition IS NULL -- somebody has said so already
+    WHERE c.condition IS NULL -- leave out steps with a verdict
 ), stretches AS (
     SELECT
         condition,
@@ -72,7 +72,7 @@ SELECT
     transition_id
 FROM stretches
 WHERE labelled OR NOT EXISTS (
-    -- What is likely beside an event is its edge, and for that event's own verdict.
+    -- Likely steps next to a labelled event are its edge, and belong to the verdict on that event.
     FROM stretches AS near
     WHERE near.labelled
         AND near.episode_id = stretches.episode_id

@@ -1,4 +1,4 @@
-"""Labels under review: their events, in several orders."""
+"""The events of labels to review, in order of doubt or at random."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from restock.errors import StoreError, spreadsheet_safe
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
-LIKELY = 0.2  # from this probability on, steps without a label may be a missed event
-EDGE_STEPS = 2  # what is so near to an event is its edge
+LIKELY = 0.2  # steps without a label and at least this probability may be a missed event
+EDGE_STEPS = 2  # steps this close to an event are its edge
 
 
 @dataclass(frozen=True)
 class DoubtfulEvent:
-    """One event of a label, or steps that may be a missed one. Times are log time, UTC."""
+    """One event of a label, or steps that may be a missed event. Times are log time, UTC."""
 
     event: str  # EPISODE/FIRST-LAST/CONDITION
     condition: str
-    labelled: bool  # False: it may be missed
-    probability: float | None  # mean over its steps; None: the condition has no rule for it
-    margin: float  # log odds that the label is right, or what stands for them: doubtful near 0
-    why: str  # what the margin is made of: probability or length
+    labelled: bool  # False: a possible missed event
+    probability: float | None  # mean over its steps; None: the condition has no probability
+    margin: float  # log odds that the label is right, or log2 of its steps; small is doubtful
+    why: str  # which of the two the margin is: probability or length
     recording: str
     source_file: str
     start_time: datetime
@@ -43,18 +43,18 @@ class DoubtfulEvent:
 
 
 _COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
-_COLUMNS += ["open", "verdict"]  # of a review file
+_COLUMNS += ["open", "verdict"]  # columns of a review file
 
 
 def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
-    """Return the events with the most doubtful labels, the most doubtful first.
+    """Return up to `most` events, the most doubtful label first.
 
-    For a condition with a probability, these are events whose mean log odds support the label
+    For a condition with a probability, the first are events whose mean log odds support the label
     least, and steps without the label that are likely enough to be a missed event. For other
     conditions, they are the shortest events. Corrected events are left out.
 
     Raises:
-        StoreError: the store holds no labels to review.
+        StoreError: the store has no recordings.
     """
     text = (files("restock.replay.review") / "doubtful.sql").read_text(encoding="utf-8")
     given = {"likely": LIKELY, "edge": EDGE_STEPS, "most": most}
@@ -69,7 +69,7 @@ def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
 def opened_by(event: DoubtfulEvent, store: str) -> str:
     """Return the command that shows an event's first step.
 
-    It also shows the messages behind that step if the recording is there.
+    It also shows the messages of that step if the recording still exists.
     """
     words = ["restock", "trace", store, str(event.transition_id)]
     if Path(event.source_file).exists():
@@ -78,7 +78,7 @@ def opened_by(event: DoubtfulEvent, store: str) -> str:
 
 
 def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]:
-    """Return the lines of a review file, with a verdict to fill in."""
+    """Return the rows of a review file, with an empty verdict."""
     rows = []
     for event in events:
         row = asdict(event)
@@ -93,7 +93,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
 
 
 def review_csv(rows: list[dict[str, Any]]) -> str:
-    """Return a review file."""
+    """Return the text of a review file."""
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -101,17 +101,17 @@ def review_csv(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-MAX_EVENTS = 5_000  # in a page
+MAX_EVENTS = 5_000  # on a page
 _HALF = MAX_EVENTS // 2
 
 
 def page_events(store: Store) -> tuple[list[dict[str, Any]], int]:
     """Return the events of a page, and how many there are in all.
 
-    Each has what `DoubtfulEvent` has, its robot and week, and its place in a random order of the
-    labelled events (None: not labelled). That order is of the events' names alone, so the first of
-    it are a random sample, whatever their labels are. Of more than MAX_EVENTS a page has those that
-    come first in one of the orders.
+    Each has the fields of `DoubtfulEvent`, its robot and week, and its place in a random order of
+    the labelled events (None: not labelled). That order depends only on the events' names, so its
+    first events are a random sample of the labelled ones. If there are more than MAX_EVENTS, the
+    page has those that come first in one of the two orders.
     """
     events = doubtful_events(store)
     robots = dict(store.sql("SELECT recording_id, tags['robot'] FROM recordings").fetchall())
@@ -129,7 +129,7 @@ def page_events(store: Store) -> tuple[list[dict[str, Any]], int]:
         rows.append(
             {
                 **asdict(event),
-                "transition_id": str(event.transition_id),  # JavaScript's numbers are too short
+                "transition_id": str(event.transition_id),  # too long for a JavaScript number
                 "start_time": event.start_time.isoformat(sep=" ", timespec="seconds"),
                 "end_time": event.end_time.isoformat(sep=" ", timespec="seconds"),
                 "doubt": doubt,

@@ -1,7 +1,7 @@
-"""The journal of a review: each verdict is on the disk before the page is told that it was taken.
+"""The journal of a review: each verdict is on disk before the page gets its confirmation.
 
-It is a file of lines of JSON in the store's folder, `review.jsonl`, to which several servers may
-append. A verdict names those that it replaces; it counts until another replaces it, or it was
+It is a JSON Lines file in the store's folder, `review.jsonl`. Several servers may append to it. A
+verdict names the verdicts that it replaces. It counts until another verdict replaces it, or it is
 written into the store.
 """
 
@@ -24,25 +24,25 @@ from restock.replay.review.verdicts import Line, check
 from restock.replay.store.store import Store
 
 NAME = "review.jsonl"
-MAX_NOTE = 2_000  # letters
+MAX_NOTE = 2_000  # characters
 
 
 class Entry(Line, frozen=True, kw_only=True, tag="verdict", tag_field="kind"):
-    """One verdict of a page; an empty one takes back those that it replaces."""
+    """One verdict of a page; an empty one takes back those in `instead_of`."""
 
     id: Annotated[str, Meta(min_length=1, max_length=40)]
-    by: Annotated[str, Meta(max_length=40)]  # the browser, a random name
+    by: Annotated[str, Meta(max_length=40)]  # a random name of the browser
     event: str
     note: Annotated[str, Meta(max_length=MAX_NOTE)] = ""
     at: str = ""  # UTC, by the server's clock
-    instead_of: tuple[str, ...] = ()
+    instead_of: tuple[str, ...] = ()  # ids of verdicts that it replaces
 
 
 class Applied(msgspec.Struct, frozen=True, tag="applied", tag_field="kind"):
-    """A note that verdicts were written into the store."""
+    """A record that verdicts were written into the store."""
 
     ids: tuple[str, ...]
-    version: int | None  # of the store
+    version: int | None  # version of the store; None: no label changed
     at: str = ""
 
 
@@ -50,7 +50,7 @@ _LINES = msgspec.json.Decoder(Entry | Applied)
 
 
 class Journal:
-    """The verdicts on a store.
+    """The verdicts on the labels of a store.
 
     Raises:
         LabelError: the store has no folder.
@@ -68,12 +68,12 @@ class Journal:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the file, to which others may have appended.
+        """Read the file again, because other servers may have appended to it.
 
-        A last line without an end is one that a killed server did not finish: it was not taken.
+        A last line without a newline is ignored: a killed server did not finish it.
 
         Raises:
-            LabelError: a line is no verdict.
+            LabelError: a line is not valid.
         """
         text = self.path.read_bytes() if self.path.exists() else b""
         try:
@@ -86,7 +86,7 @@ class Journal:
             ) from error
 
     def append(self, lines: Sequence[Entry | Applied]) -> None:
-        """Append lines together; they are on the disk when this returns.
+        """Append all lines at once; they are on disk when this returns.
 
         Raises:
             LabelError: the file cannot be written.
@@ -96,7 +96,7 @@ class Journal:
         try:
             with self.path.open("ab+") as stream:
                 fcntl.flock(stream, fcntl.LOCK_EX)
-                stream.seek(0)  # what a killed server left without an end is not a line
+                stream.seek(0)  # remove an unfinished last line of a killed server
                 stream.truncate(stream.read().rfind(b"\n") + 1)
                 stream.write(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
                 stream.flush()
@@ -110,7 +110,7 @@ class Journal:
         self.refresh()
 
     def counting(self) -> list[Entry]:
-        """Return the verdicts that count: not replaced, not taken back, not in the store yet."""
+        """Return the verdicts that count: not replaced, not taken back, not yet in the store."""
         gone = {
             name
             for line in self.lines
@@ -122,16 +122,16 @@ class Journal:
 
 @dataclass(frozen=True)
 class Written:
-    """What became of a journal's verdicts."""
+    """The result of writing a journal's verdicts into the store."""
 
     outcomes: list[Corrected] = field(default_factory=list)
-    version: int | None = None  # of the store; None: its labels are as they were
-    taken: int = 0
-    held_back: list[str] = field(default_factory=list)  # why, a sentence each
+    version: int | None = None  # new version of the store; None: no label changed
+    taken: int = 0  # number of verdicts written
+    held_back: list[str] = field(default_factory=list)  # reason for each verdict not written
 
     @property
     def document(self) -> dict[str, object]:
-        """Return it as `--json` and the page have it."""
+        """Return the result as in `--json` and on the page."""
         return {
             "version": self.version,
             "verdicts": self.taken,
@@ -143,7 +143,7 @@ class Written:
 def write_verdicts(journal: Journal, place: Location) -> Written:
     """Write the verdicts that count into the store, in one commit.
 
-    Those whose rows were replaced stay in the journal, and are named.
+    Verdicts that no longer fit the store's rows stay in the journal, and are reported.
 
     Raises:
         StoreError: the store cannot be written.

@@ -1,4 +1,4 @@
-"""What a review page shows of an event: the way driven, scans, plans, speeds, what the rule saw."""
+"""Data that a review page shows of an event: path, scans, plans, speeds, and the rule's values."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from restock.replay.store.frames import camera_frames
 from restock.replay.store.store import Store
 from restock.replay.trace.moment import SeenScan, sector_ranges, seen_of
 
-AROUND_S = 8.0  # that is shown before and after an event
-MAX_STEPS = 400  # that are shown
-MAX_ROWS = 4_000  # of an episode: the rest of a longer one is not looked at
-MAX_RECORDING_BYTES = 256 << 20  # of a larger one, scans and plans are not read
-MAX_FRAMES = 12  # of each camera
-FRAME_PX = 400  # wide
+AROUND_S = 8.0  # seconds shown before and after an event
+MAX_STEPS = 400  # steps shown
+MAX_ROWS = 4_000  # rows of the episode that are read around the event
+MAX_RECORDING_BYTES = 256 << 20  # scans and plans are not read from larger recordings
+MAX_FRAMES = 12  # per camera
+FRAME_PX = 400  # largest width and height
 WALL_M, WALL_ROWS, MAX_WALLS, REACH_M = 0.1, 5_000, 6_000, 8.0
 SPEEDS = {
     "wheels": "wheel_speed_mps",
@@ -58,23 +58,23 @@ WHERE recording_id = $recording
 
 
 class Moments:
-    """What is shown of the events of an open store. Not for several threads at a time."""
+    """Collects the data to show of a store's events. Not thread-safe."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
         rows = store.connection.sql("FROM recordings").to_arrow_table().to_pylist()
         self._manifests = {row["recording_id"]: row for row in rows}
-        # Of the recording that was looked at last: events come by recording more often than not.
+        # Cached per recording: successive events are often of the same one.
         self._ends = cache(self._read_ends)
         self._walls = cache(self._read_walls)
         self._aligned: tuple[str, AlignedInputs | str] = ("", "")
 
     def show(self, event: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is shown of an event, as JSON has it.
+        """Return the data to show of an event as JSON values.
 
         Lengths are in metres, times in seconds after the recording's first step. Scans are points
-        in the robot's frame, in centimetres: x, y, x, y, … What is not known is null or absent;
-        `notes` say why.
+        in the robot's frame, in centimetres: x, y, x, y, … Unknown values are null or absent;
+        `notes` give reasons.
         """
         manifest = self._manifests[event["recording"]]
         task = msgspec.json.decode(manifest["task_json"], type=Task, strict=False)
@@ -115,7 +115,7 @@ class Moments:
         }
 
     def frames(self, event: Mapping[str, Any]) -> dict[str, Any]:
-        """Return small pictures of the cameras that the profile names: step and data URI each."""
+        """Return small pictures of the recording's cameras, each with its step, as data URIs."""
         cameras = self._manifests[event["recording"]]["cameras"] or []
         if not cameras:
             return {"cameras": {}, "notes": []}
@@ -129,7 +129,7 @@ class Moments:
                 "last": event["last_step"] + 10,
             },
         ).fetchall()
-        steps = dict(ids[:: max(-(-len(ids) // MAX_FRAMES), 1)])  # rounded up: no more than that
+        steps = dict(ids[:: max(-(-len(ids) // MAX_FRAMES), 1)])  # at most MAX_FRAMES
         notes = []
         try:
             for frame in camera_frames(self.store, list(steps)):
@@ -141,7 +141,7 @@ class Moments:
         return {"cameras": {name: own for name, own in found.items() if own}, "notes": notes}
 
     def _times(self, event: Mapping[str, Any], window: pa.Table) -> list[float]:
-        """Return the seconds of steps after the recording's first step, as the event counts."""
+        """Return the times of steps in seconds, on the same zero as the event's `start_s`."""
         stamps = window["logged_ns"].to_numpy()
         step = window["step_index"].to_numpy()
         own = stamps[np.searchsorted(step, event["first_step"])]
@@ -150,7 +150,7 @@ class Moments:
     def _poses(
         self, rows: pa.Table, window: pa.Table, recording: str, task: Task
     ) -> dict[str, Any]:
-        """Return the poses that are shown, the whole way, and what stands around it."""
+        """Return the poses of the shown steps, the path around them, and walls near it."""
         poses = [numbers(window[name], 3) for name in ("pose_x_m", "pose_y_m", "pose_yaw_rad")]
         way = np.stack([floats(rows[name]) for name in ("pose_x_m", "pose_y_m")], axis=1)
         way = way[:: max(len(way) // 1_000, 1)]
@@ -171,9 +171,9 @@ class Moments:
         }
 
     def _read_walls(self, recording: str, task: Task) -> F64:
-        """Return the middles (K, 2) of the cells of a recording's map in which its lidar ended.
+        """Return the centres (K, 2) of the map cells that the recording's lidar beams hit.
 
-        The more often a cell was hit, the earlier it comes; those hit once are left out.
+        Cells hit most often come first; cells hit once are left out.
         """
         rows = self.store.connection.sql(
             _WALLS, params={"recording": recording, "rows": WALL_ROWS}
@@ -203,7 +203,7 @@ class Moments:
     ) -> dict[str, Any]:
         """Return scan, plan and goal at each step.
 
-        They are as recorded if the recording is still there, else as the policy saw them.
+        They are read from the recording. If that is not possible, scans come from the observations.
         """
         stamps = window["stamp_ns"].to_numpy()
         aligned = self._align(manifest)
@@ -249,7 +249,7 @@ class Moments:
         return shown
 
     def _align(self, manifest: Mapping[str, Any]) -> AlignedInputs | str:
-        """Return the inputs of a recording, or why they cannot be read."""
+        """Return the aligned inputs of a recording, or the reason why they cannot be read."""
         recording = manifest["recording_id"]
         if self._aligned[0] != recording:
             self._aligned = (recording, _read_inputs(manifest))
@@ -268,14 +268,14 @@ class Moments:
     def _rule(
         self, manifest: Mapping[str, Any], condition: Condition, rows: pa.Table, part: slice
     ) -> dict[str, Any]:
-        """Return a condition, and the values of the signals and terms that it names."""
+        """Return a condition's definition, and the values of signals and terms in it."""
         steps = self._steps(manifest, rows)
         values = {
             name: rows[name]
             for name in rows.column_names
             if name in condition.words and _is_number(rows[name].type) and name[-3:] != "_ns"
         }
-        with suppress(ConfigError):  # a term may be a text
+        with suppress(ConfigError):  # a term may be text
             terms = let_values(steps, condition)
             values |= {name: pa.chunked_array([pa.array(own)]) for name, own in terms.items()}
         return {
@@ -293,7 +293,7 @@ class Moments:
         }
 
     def _steps(self, manifest: Mapping[str, Any], rows: pa.Table) -> pa.Table:
-        """Return an episode's steps as conditions see them: with the end of the episode."""
+        """Return an episode's steps with its final step, as for evaluating conditions."""
         ends = self._ends(manifest["recording_id"])
         if ends is None:
             return rows
@@ -306,7 +306,7 @@ class Moments:
 
 
 def _read_inputs(manifest: Mapping[str, Any]) -> AlignedInputs | str:
-    """Read the inputs of a recording; return why not, if that cannot be."""
+    """Read and align the inputs of a recording; return the reason if that fails."""
     path = Path(manifest["source_file"])
     if not path.exists():
         return f"{path.name} is no longer where it was ingested from"
@@ -324,7 +324,10 @@ def _read_inputs(manifest: Mapping[str, Any]) -> AlignedInputs | str:
 
 
 def points(scan: SeenScan, body: Body) -> list[int]:
-    """Return where a scan's beams ended in the robot's frame, in centimetres: x, y, x, y and on."""
+    """Return end points of a scan's beams in the robot's frame, in centimetres, as x, y, x, y, ….
+
+    Larger scans are thinned to fewer than 720 points.
+    """
     back = np.flatnonzero(np.isfinite(scan.ranges_m) & (scan.ranges_m > 0))
     back = back[:: max(len(back) // 360, 1)]
     bearing = scan.angle_min_rad + scan.angle_increment_rad * back + body.lidar_yaw_rad
@@ -335,13 +338,13 @@ def points(scan: SeenScan, body: Body) -> list[int]:
 
 
 def floats(column: pa.ChunkedArray) -> F64:
-    """Return a column of numbers, NaN where there is none."""
+    """Convert a column to float64, null to NaN."""
     values: F64 = column.cast(pa.float64()).combine_chunks().to_numpy(zero_copy_only=False)
     return values
 
 
 def numbers(column: pa.ChunkedArray, digits: int) -> list[float | None]:
-    """Return a column as JSON has it: null where it is not finite."""
+    """Convert a column to rounded JSON numbers; null if not finite."""
     return [_finite(value, digits) for value in floats(column).tolist()]
 
 
@@ -356,7 +359,7 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 def _columns(window: pa.Table, names: Mapping[str, str]) -> dict[str, list[float | None]]:
-    """Return these columns, without those that are unknown everywhere."""
+    """Return columns by title, without those that are unknown in all rows."""
     found = {title: numbers(window[name], 3) for title, name in names.items()}
     return {title: own for title, own in found.items() if any(v is not None for v in own)}
 
@@ -377,7 +380,7 @@ def _probabilities(window: pa.Table, names: Sequence[str]) -> dict[str, list[flo
 
 
 def _jpeg(image: np.ndarray[Any, Any]) -> str:
-    """Return a picture as a small JPEG, in a data URI; a depth image in grey, near is dark."""
+    """Return a picture as a small JPEG in a data URI; depth images in grey, with near dark."""
     from PIL import Image
 
     if image.dtype != np.uint8:

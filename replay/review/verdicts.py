@@ -1,7 +1,8 @@
 """Verdicts of people on labels, read from a file or a review page and checked against the store.
 
-Each verdict speaks of one condition on some steps of one episode. Everything is checked against the
-rows of the store before anything is accepted. Where two speak of the same steps, the later counts.
+Each verdict is about one condition on some steps of one episode. All verdicts of a file are checked
+against the rows of the store before any is accepted. If two are about the same steps, the later
+counts.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from restock.ingest.relabel import RecordingCorrections
 from restock.ingest.store.manifest import Correction
 from restock.replay.store.store import Store
 
-_MOVED_S = 0.1  # by which a step's time may differ from the file's
-_MAX_SAID = 10  # problems of a file that are named
+_MOVED_S = 0.1  # largest difference of a step's time from the time in the file
+_MAX_SAID = 10  # largest number of a file's problems in the error message
 _ROWS = """
 SELECT
     recording_id, ingest_id, episode_id, episode_index, step_index, logged_ns,
@@ -49,18 +50,18 @@ Step = Annotated[int, Meta(ge=0, le=999_999_999)]
 
 
 class Line(msgspec.Struct, frozen=True, kw_only=True):
-    """A verdict as it is written, before it is looked up."""
+    """A verdict as written, before it is checked against the store."""
 
     episode_id: str
     condition: str
     first_step: Step
     last_step: Step
-    # yes, no, or the steps at which it truly holds; empty: none
+    # yes, no, or FIRST..LAST (the steps in which it truly holds); empty: no verdict
     verdict: Annotated[str, Meta(pattern=r"^(yes|no|[0-9]{1,9}\.\.[0-9]{1,9}|)$")] = ""
-    start_s: float | None = None  # of its first step, when it was shown
+    start_s: float | None = None  # time of its first step when it was shown
 
     def says(self) -> list[tuple[int, int, bool]]:
-        """Return what it says: first and last step of each stretch, and whether it holds there."""
+        """Return ranges of steps: first, last, and whether the condition holds there."""
         own = (self.first_step, self.last_step)
         first, dots, last = self.verdict.partition("..")
         if not dots:
@@ -72,17 +73,17 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What lines say, by recording, and what is wrong with some of them."""
+    """Checked verdicts: the valid ones as corrections, and problems of the others."""
 
-    given: dict[str, RecordingCorrections]
-    taken: int  # lines
-    problems: dict[int, str]  # by the line's number
-    left_open: int = 0  # lines of a file that have no verdict
+    given: dict[str, RecordingCorrections]  # recording id -> its corrections
+    taken: int  # number of valid lines
+    problems: dict[int, str]  # line number -> problem
+    left_open: int = 0  # lines of a file without a verdict
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """The rows of one episode that is spoken of."""
+    """The rows of one episode with verdicts."""
 
     recording_id: str
     ingest_id: str
@@ -92,15 +93,15 @@ class _Episode:
     recording_start_ns: int
 
     def rows(self, first: int, last: int) -> Ints:
-        """Return the rows of these steps."""
+        """Return the row numbers of the steps from `first` to `last`."""
         return np.flatnonzero((self.step >= first) & (self.step <= last))
 
 
 def read_verdicts(path: Path | str, store: Store) -> Verdicts:
-    """Read the corrections that a CSV file gives, every line of it checked.
+    """Read verdicts from a CSV file, and check every line.
 
     Raises:
-        LabelError: the file cannot be read, or lines name rows or a condition that are not there.
+        LabelError: the file cannot be read, or a line does not fit the store.
     """
     path, left_open = Path(path), 0
     lines: list[tuple[int, Line]] = []
@@ -136,7 +137,7 @@ def read_verdicts(path: Path | str, store: Store) -> Verdicts:
 
 
 def _rows(text: str, path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the lines of a CSV file by their numbers, without empty cells."""
+    """Yield the number of each line of a CSV file, and its cells that are not empty."""
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
         columns = reader.fieldnames or ()
@@ -156,7 +157,7 @@ def _rows(text: str, path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def check(lines: Iterable[tuple[int, Line]], store: Store) -> Verdicts:
-    """Return what numbered lines say of the rows of a store, and the problems of the others."""
+    """Check numbered lines against the rows of a store."""
     lines = list(lines)
     episodes = _episodes(store, {line.episode_id for _, line in lines})
     known = {ingest: names for ingest, _, names in store.sql(CONDITIONS).fetchall()}
@@ -188,7 +189,7 @@ def check(lines: Iterable[tuple[int, Line]], store: Store) -> Verdicts:
 
 
 def _problem(line: Line, episode: _Episode, conditions: list[str]) -> str:
-    """Return what does not fit the rows of the episode, or ""."""
+    """Return how a line does not fit the rows of its episode, or ""."""
     if line.condition not in conditions:
         has = ", ".join(conditions)
         return f"no condition {line.condition!r} labelled that recording: it has {has}"
@@ -212,7 +213,7 @@ def _problem(line: Line, episode: _Episode, conditions: list[str]) -> str:
 
 
 def _episodes(store: Store, wanted: Iterable[str]) -> dict[str, _Episode]:
-    """Return those of these episodes that are in the store."""
+    """Return the wanted episodes that are in the store, by id."""
     table = store.connection.sql(_ROWS, params={"wanted": sorted(wanted)}).to_arrow_table()
     names, begins = np.unique(table["episode_id"].to_numpy(), return_index=True)
     ends = [*begins[1:].tolist(), len(table)]
