@@ -1,1 +1,1 @@
-"""From a sampled row back to the messages it was made from."""
+"""Trace a sampled row back to the messages from which it was made."""

@@ -1,4 +1,4 @@
-"""What a robot saw at a moment: scans, plan and goal at ticks, and ranges from observations."""
+"""What a robot perceived: scans, plan and goal at ticks, and ranges from observations."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from restock.ingest.steps.needs import angle_keys, beam_angles
 from restock.ingest.task.surroundings import outline_reach
 from restock.ingest.task.task import Body, Task
 
-BINS = 720  # of bearings, where scans are put together
+BINS = 720  # bearings of a merged scan
 
 
 @dataclass(frozen=True)
 class SeenScan:
-    """A lidar's scan as it was recorded, its angles as seen from above."""
+    """A lidar's scan as recorded, with angles counterclockwise as seen from above."""
 
     stamp_ns: int  # when it was measured, on the alignment clock
-    ranges_m: F64  # (B,); inf and NaN as the lidar has them
+    ranges_m: F64  # (B,); inf and NaN as in the message
     angle_min_rad: float
     angle_increment_rad: float
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What was known at T ticks. None where the profile has no such input, or nothing was fresh."""
+    """Scans, plans and goals at T ticks; None if the profile lacks the input or it is not fresh."""
 
     stamp_ns: Ints  # (T,)
     scans: list[SeenScan | None]
-    plans_m: list[F64 | None]  # of (P, 2) points in the fixed frame
+    plans_m: list[F64 | None]  # (P, 2) points in the fixed frame
     goals_m: list[tuple[float, float] | None]
 
 
 def seen_of(aligned: AlignedInputs, low_ns: int, high_ns: int) -> Seen:
-    """Return what the ticks in [low_ns, high_ns] saw, of inputs that were read and aligned."""
+    """Return scans, plans and goals at the ticks in [low_ns, high_ns] from aligned inputs."""
     inside = [stamps[(stamps >= low_ns) & (stamps <= high_ns)] for stamps in aligned.ticks]
     aligned = replace(aligned, ticks=inside)
     stamps = np.concatenate(inside) if inside else np.zeros(0, np.int64)
@@ -47,9 +47,10 @@ def seen_of(aligned: AlignedInputs, low_ns: int, high_ns: int) -> Seen:
 
 
 def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
-    """Return the scan at each stamp, as recorded or as seen from the body's own lidar.
+    """Return the scan at each stamp.
 
-    The latter if the lidars are mounted elsewhere.
+    It is as recorded, or if the profile has mounting positions of lidars, merged and converted to
+    the position of the body's lidar.
     """
     scans = aligned.profile.inputs.scans
     if not scans or not scans.keys() <= aligned.inputs.by_name.keys():
@@ -119,7 +120,7 @@ def _goals(aligned: AlignedInputs, stamps: Ints) -> list[tuple[float, float] | N
 def sector_ranges(task: Task, observations: F32) -> tuple[F64, F64]:
     """Return the bearing of each sector, (S,), and the ranges in N observations, (N, S); inf: free.
 
-    Both are as seen from the middle of the robot, whose lidar the task must have.
+    Both are as seen from the lidar, with bearing 0 straight ahead. The task must have a lidar.
     """
     names = task.observation_names
     first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))

@@ -1,4 +1,4 @@
-"""Where a row of a store came from: its ingest, its recording, and the messages it was made of."""
+"""Find the source of a store's row: its ingest, its recording, and the messages of its tick."""
 
 from __future__ import annotations
 
@@ -35,37 +35,37 @@ from restock.replay.store.store import Store, is_store
 
 @dataclass(frozen=True)
 class MessageAtTick:
-    """A message that a tick was made of, and what it is for."""
+    """A message that was used at a tick, and the input that used it."""
 
-    input: str  # of the profile, or `signals.NAME`
+    input: str  # input of the profile, or `signals.NAME`
     topic: str
     type: str
     log_time_ns: int
     publish_time_ns: int
     stamp_ns: int  # on the alignment clock
-    age_s: float  # at the tick; below 0 where it may come a moment later
+    age_s: float  # at the tick; negative if the input may use a slightly later message
     max_age_s: float | None  # None: latched
-    fields: dict[str, Any]  # by field path
+    fields: dict[str, Any]  # field path -> value
 
 
 def messages_at_tick(
     path: str | Path, profile: Profile, *, recording_id: str, tick: int, stamp_ns: int
 ) -> list[MessageAtTick]:
-    """Return the messages that one tick of a recording was made of, by age.
+    """Return the messages used at one tick of a recording, youngest first.
 
-    Of each input and custom signal the latest one, and where the pose comes from transforms, each
-    transform on the way.
+    These are the latest message of each input and custom signal, and, if the pose comes from
+    transforms, each transform in the chain.
 
     Args:
         path: the recording.
-        profile: the one that read it.
-        recording_id: which recording it must be.
-        tick: of the control clock, from 0: the low bits of a transition's id.
-        stamp_ns: of that tick, on the alignment clock.
+        profile: the profile with which it was read.
+        recording_id: the expected id of the recording.
+        tick: number of the tick on the control clock, from 0: the low bits of a transition's id.
+        stamp_ns: stamp of that tick, on the alignment clock.
 
     Raises:
-        RecordingError: it cannot be read, is another recording, does not fit the profile, or has
-            another tick there.
+        RecordingError: it cannot be read, has another id, does not fit the profile, or has no such
+            tick at that stamp.
     """
     with open_recording(path, salvage=True) as recording:
         if recording.recording_id != recording_id:
@@ -105,7 +105,7 @@ def messages_at_tick(
     return sorted(named, key=lambda message: message.age_s)
 
 
-# Input, topic, maximum age, the columns that the message is in and its row there, age, fields.
+# Input, topic, maximum age, the topic's columns, the message's row in them, age, fields.
 _Message = tuple[str, str, float | None, TopicColumns, int, int, dict[str, Any]]
 
 
@@ -119,7 +119,7 @@ def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
-    """Yield what each custom signal makes of its message, by its path."""
+    """Yield the message of each custom signal, with the signal's value under its path."""
     for name, signal in aligned.profile.signals.items():
         columns = aligned.inputs.topics.get(signal.topic)
         if columns is None:
@@ -133,7 +133,7 @@ def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
-    """Yield the transforms from the robot's frame up to the fixed one, where they give the pose."""
+    """Yield the transforms from the robot's frame to the fixed frame, if they give the pose."""
     tree = aligned.tree
     if tree is None or "pose" in aligned.inputs.by_name:
         return
@@ -153,11 +153,11 @@ def _value(column: FieldColumn, row: int) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-# Where in log time the messages of a tick lie: it takes a while until the next ones come, and
-# some take longer than others to be received.
+# Range of log times around a tick in which its messages lie: topics have different rates, and some
+# messages take longer to be received.
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
-# Of a manifest: long.
+# Long fields of a manifest that a trace leaves out.
 _LEFT_OUT = (
     "task_json",
     "conditions_json",
@@ -171,7 +171,7 @@ _LEFT_OUT = (
 
 @dataclass(frozen=True)
 class StoreVersion:
-    """A store to look in, at a version (None: the newest)."""
+    """A store to search, at a version (None: the newest)."""
 
     path: str
     version: int | None = None
@@ -179,16 +179,16 @@ class StoreVersion:
 
 @dataclass
 class Origin:
-    """All that is known of a stored row. What is not known is None or empty; `notes` say why."""
+    """Everything known about a stored row. Unknown fields are None or empty; see `notes`."""
 
-    transition: dict[str, Any]  # the row as it lies in the store
+    transition: dict[str, Any]  # the row as stored
     store: dict[str, Any]
-    moment: dict[str, Any]  # when it was, by stamp and by log time
-    reward_parts: dict[str, float] | None = None  # what each event of the step was worth
+    moment: dict[str, Any]  # its times, by stamp and by log time
+    reward_parts: dict[str, float] | None = None  # reward of each event in the step
     recording: dict[str, Any] | None = None  # the manifest of the ingest that wrote the row
-    topics: list[dict[str, Any]] = field(default_factory=list)  # that the profile reads
-    messages: list[MessageAtTick] = field(default_factory=list)  # that its tick was made of
-    frames: list[dict[str, Any]] = field(default_factory=list)  # of cameras, and their file
+    topics: list[dict[str, Any]] = field(default_factory=list)  # topics that the profile reads
+    messages: list[MessageAtTick] = field(default_factory=list)  # messages used at its tick
+    frames: list[dict[str, Any]] = field(default_factory=list)  # camera frames, with their file
     notes: list[str] = field(default_factory=list)
 
 
@@ -198,16 +198,16 @@ def find_origin(
     *,
     recording: Path | str | None = None,
 ) -> Origin:
-    """Look a transition up in the stores, first to last.
+    """Look up a transition in stores, first to last.
 
     Args:
         sources: the stores.
         transition: its id.
-        recording: the recording, to read the messages that its tick was made of.
+        recording: its recording, to read the messages of its tick; None: do not read them.
 
     Raises:
-        StoreError: a store is not there, or none has the row.
-        RecordingError: the recording given is not the one the row is of.
+        StoreError: a store does not exist, or no store has the row.
+        RecordingError: `recording` is not the row's recording.
     """
     for source in sources:
         if not is_store(source.path):
@@ -229,7 +229,7 @@ def find_origin(
 
 
 def _look_up(source: StoreVersion, transition: int) -> Origin | None:
-    """Return the row at that version, or as it is now where that version can no longer be read."""
+    """Return the row at that version; at the newest version if that one can no longer be read."""
     now = _read(StoreVersion(source.path), transition)
     if source.version is None:
         return now
@@ -247,7 +247,7 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
 
 
 def _read(source: StoreVersion, transition: int) -> Origin | None:
-    """Read a row with what stands around it; None where that version, or its files, are gone."""
+    """Read a row with its manifest, frames and reward; None if it, or its version, is gone."""
     try:
         with Store(source.path, version=source.version) as store:
             rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
@@ -292,7 +292,7 @@ def _frames(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return each camera's frame at a row, with its file, and notes on frames that are missing.
 
-    A later ingest replaces the frames of a recording along with its rows.
+    A later ingest replaces a recording's frames along with its rows.
     """
     kept = {one["camera"]: one for one in (manifest or {}).get("cameras") or []}
     if manifest is None or not kept:
@@ -314,10 +314,10 @@ def _frames(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return the rows that a query gives, by column.
+    """Return the rows of a query as dicts.
 
     Raises:
-        StoreError: the file that it asks (its parameter `file`) cannot be read.
+        StoreError: the file that it reads (its parameter `file`) is damaged.
     """
     try:
         relation = connection.sql(sql, params=dict(parameters))
@@ -333,7 +333,7 @@ def rows_of(
 
 
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
-    """Return what became of a row since."""
+    """Return a note if a row changed, or is gone, in the newest version of the store."""
     if now is None:
         return ["the newest version of the store no longer has this row"]
     changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
@@ -344,10 +344,7 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
 
 
 def _interpret(origin: Origin, recording: Path | str | None) -> None:
-    """Add the topics that the profile read, and the messages of the row's tick.
-
-    The messages need the recording.
-    """
+    """Add the topics that the profile reads, and given a recording, the messages of the tick."""
     manifest, row = origin.recording, origin.transition
     if manifest is None:
         return
@@ -397,7 +394,7 @@ def _reward_parts(
 ) -> dict[str, float] | None:
     """Return the reward of each event of a step; None at an episode's last step.
 
-    The end of that step is not a row.
+    The state after that step is not stored as a row.
     """
     after = near.get(row["step_index"] + 1)
     if after is None:
@@ -408,7 +405,7 @@ def _reward_parts(
 
     def columns(signals: Mapping[str, Any]) -> dict[str, Any]:
         return {
-            name: np.array([np.nan if value is None else value])  # null: what is not known
+            name: np.array([np.nan if value is None else value])  # null: unknown
             for name, value in signals.items()
             if value is None or isinstance(value, bool | int | float)
         }
@@ -421,13 +418,13 @@ def _reward_parts(
         np.array([row["action"]]),
         np.array([previous]),
     )
-    if task.reward_terms:  # they may look back farther than what is near
+    if task.reward_terms:  # computed as the rest, because they may need earlier steps
         parts[" + ".join(task.reward_terms)] = row["reward"] - np.asarray(sum(parts.values()))
     return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
 
 
 def profile_of(origin: Origin, manifest: Mapping[str, Any]) -> Profile | None:
-    """Return the profile that read the recording, as its manifest has it; None if it is damaged."""
+    """Return the profile in the manifest of the recording; None if it cannot be read."""
     name = manifest["profile"]
     try:
         profile = parse_profile(manifest["profile_toml"], where=f"profile {name!r}")
@@ -444,5 +441,5 @@ def profile_of(origin: Origin, manifest: Mapping[str, Any]) -> Profile | None:
 
 @cache
 def sql_file(name: str) -> str:
-    """Return a query of this folder."""
+    """Return the text of a query in this folder."""
     return (files("restock.replay.trace") / name).read_text(encoding="utf-8")

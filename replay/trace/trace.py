@@ -1,6 +1,6 @@
-"""Where a sampled row came from: audit row, panel, store, recording, messages.
+"""Trace a sampled row to its source: audit row, panel, store, recording, messages.
 
-A run names its panel and a panel its store, so a trace can begin at any of them.
+A run has the path of its panel, and a panel that of its store, so a trace can begin at any of them.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_
 
 @dataclass
 class Trace:
-    """All that is known of one sampled row. What does not apply is None; `notes` say why."""
+    """Everything known about one sampled row. Fields that do not apply are None; see `notes`."""
 
     audit: dict[str, Any] | None = None  # the row as it was sampled
-    episode: dict[str, Any] | None = None  # of a fresh row: how it can be laid out again
+    episode: dict[str, Any] | None = None  # of a fresh row, with what generates it again
     panel: dict[str, Any] | None = None
-    origin: Origin | None = None  # in a store
+    origin: Origin | None = None  # the row in a store
     notes: list[str] = field(default_factory=list)
 
 
 def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None = None) -> Trace:
-    """Follow one row of a run, a panel or a store down to its messages.
+    """Trace one row of a run, a panel or a store back to its messages.
 
     Args:
         place: a run (`row` is STEP/ROW: gradient step and row of the batch), a panel (`row` is a
             row number) or a store, or `store@12` (`row` is a transition id).
-        row: which row.
-        where: places that were moved, and the recording whose messages to read.
+        row: the row.
+        recording: the row's recording, to read its messages; None: do not read them.
 
     Raises:
-        RunError, PanelError, StoreError: no such place or row, or the next place down is not
-            where it was.
-        RecordingError: the recording given is not the one the row is of.
+        RunError, PanelError, StoreError: no such place or row, or the run's panel or the panel's
+            store was moved.
+        RecordingError: `recording` is not the row's recording.
     """
     path, row = Path(place), str(row)
     trace = Trace()
@@ -73,9 +73,9 @@ def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None
 
 
 def listed_rows(place: str | Path, limit: int = 20) -> list[dict[str, Any]]:
-    """Return a run's audited rows with the largest TD errors, or the strangest rows of a store.
+    """Return a run's audited rows with the largest TD errors, or the most novel rows of a store.
 
-    Each has its name for `trace_row`, `row`.
+    In each dict, `row` is the argument for `trace_row`.
     """
     run = Path(place)
     if not (run / RUN_CONFIG).is_file():
@@ -148,7 +148,7 @@ def _origin(sources: list[StoreVersion], transition: int, recording: Path | str 
 def _of_twin(
     trace: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
-    """Trace a fresh row: add its episode in the twin and how to generate it again."""
+    """Add a fresh row's episode in the twin, and the spec to generate it again."""
     query = "FROM episodes WHERE episode = $episode"
     table = _run_table(run, "episodes")
     with duckdb.connect() as connection, passed_in(connection, episodes=table):

@@ -1,5 +1,5 @@
--- One transition as it lies in the store: straight from the files, for the views hide rows whose
--- recording was replaced since.
+-- One transition as stored. It is read from the files, because the views hide rows of recordings that were
+-- replaced later.
 SELECT
     * REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation)
 FROM stored_transitions

@@ -1,4 +1,4 @@
--- The frame of each camera in force at a row's step. Its bytes stay where they are.
+-- The latest frame of each camera at a row's step, without its image data.
 SELECT
     camera,
     topic,

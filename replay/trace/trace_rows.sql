@@ -1,4 +1,4 @@
--- Audited rows of a run, those with the largest TD errors first: `row` is the name for `trace`.
+-- Audited rows of a run, largest |TD error| first. `row` is the argument for `restock trace`.
 SELECT
     gradient_step || '/' || batch_row AS row,
     source,
