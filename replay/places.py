@@ -1,4 +1,4 @@
-"""What can be queried: a store, a run, a panel or recordings, as views of one connection."""
+"""Places to query: a store, a run, a panel or recordings, as views of one connection."""
 
 from __future__ import annotations
 
@@ -38,23 +38,22 @@ def open_place(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Yield a connection with the views of a store, a run or a panel, or the topics of recordings.
 
-    Query it with `query` or `install_named`, which make those views that a text names.
+    Query it with `query`, or call `install_named` first: they create the views that a query names.
 
     Args:
         path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version; a
             recording, a folder of recordings, or a glob.
-        beside: a run and a panel, each under a schema of its own: `{"run": "runs/a"}` gives
+        beside: schema -> path of a run or a panel to add to a store: `{"run": "runs/a"}` gives
             `run.audit`, `{"panel": "panel"}` gives `panel.rows`.
-        only_store: take nothing but a store.
+        only_store: accept only a store.
         opened: called with the store before it is queried: `Store.verify` verifies its files.
         lost: called with each loss of recordings: damage, or messages of a topic that was read.
-        confined: let queries read no files but those of the place.
+        confined: restrict queries to the files of the place.
 
     Raises:
-        RecordingError: a file that is no recording, or a folder without one that can be opened.
-        StoreError: there is nothing that can be queried, or no such version; or what is beside it
-            is no run or panel, or has logged rows, all of them of recordings that the store does
-            not hold.
+        RecordingError: a file is not a recording, or a folder has none that can be opened.
+        StoreError: the place cannot be queried, or has no such version; or a place in `beside` is
+            not a run or panel, or all its logged rows are of recordings that the store lacks.
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
@@ -89,15 +88,15 @@ def open_place(
         if confined:
             _confine(connection, None if topics else path)
         yield connection
-        del topics  # its tables are made on demand as long as it is there
+        del topics  # kept until here because it creates tables on demand
 
 
 def _topics(
     connection: duckdb.DuckDBPyConnection, path: Path, lost: Callable[[str], None], *, remedy: str
 ) -> object:
-    """Make the topics of recordings tables; return what makes them."""
+    """Install the topics of recordings as tables; return the object that creates them."""
     from restock.ingest.containers.open_recording import recordings_in
-    from restock.replay.topics import Topics  # with it comes rosbags
+    from restock.replay.topics import Topics  # imported here because it pulls in rosbags
 
     try:
         recordings_in(path)
@@ -112,13 +111,13 @@ def _topics(
     return Topics(connection, path, lost)
 
 
-# Table of a place -> what its rows say of conditions, and what there is to see first.
+# Table of a panel or run -> query for its rows by condition.
 _COVERAGE = {
     "rows": "SELECT condition, count(*) AS rows FROM rows GROUP BY ALL ORDER BY ALL",
     "replay_audit": "SELECT condition, count(*) AS sampled FROM replay_audit GROUP BY ALL ORDER BY"
     " ALL",
 }
-_OVERVIEW = {"topics": "FROM topics", "strata": "FROM strata"}
+_OVERVIEW = {"topics": "FROM topics", "strata": "FROM strata"}  # table -> query for `Place.show`
 
 
 class Place:
@@ -127,11 +126,11 @@ class Place:
     Args:
         path: a run's or a panel's folder; a recording, a folder of recordings, or a glob.
 
-    `lost` lists what recordings have lost: damage, and messages of topics that were read.
+    `lost` lists losses of recordings: damage, and lost messages of topics that were read.
 
     Raises:
-        StoreError: there is nothing that can be queried.
-        RecordingError: as `open_place` does.
+        StoreError: the place cannot be queried.
+        RecordingError: see `open_place`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -150,22 +149,22 @@ class Place:
         return f"<Place {self.path}>"
 
     def close(self) -> None:
-        """Close its files."""
+        """Close the connection and its files."""
         self._opened.close()
 
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
         """Return the result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 
         Raises:
-            QueryError: DuckDB's message, or the query would write.
+            QueryError: the query fails, with DuckDB's message, or it would write.
         """
         return query(self._connection, text, where=str(self.path))
 
     def coverage(self) -> duckdb.DuckDBPyRelation:
-        """Return the rows of each condition: of a panel the packed ones, of a run the sampled ones.
+        """Count a panel's packed rows, or a run's audited sampled rows, by condition.
 
         Raises:
-            StoreError: it has no labels, as a recording has none.
+            StoreError: the place has no labels, as with recordings.
         """
         text = self._first(_COVERAGE)
         if text is None:
@@ -177,12 +176,12 @@ class Place:
         return self.sql(text)
 
     def show(self) -> None:
-        """Print what it holds: the topics of recordings, or the strata of a panel or a run."""
+        """Print an overview: the topics of recordings, or the strata of a panel or a run."""
         text = self._first(_OVERVIEW) or "FROM columns"
         self.sql(text).show()
 
     def _first(self, questions: Mapping[str, str]) -> str | None:
-        """Return the first question about a table that is there."""
+        """Return the first query whose table exists; None if there is none."""
         install_named(self._connection, " ".join(questions))
         found = self._connection.sql("SHOW TABLES").fetchall()
         names = {name for (name,) in found}
@@ -190,7 +189,7 @@ class Place:
 
 
 def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None:
-    """Let the connection read no file and no Python object but those of a folder."""
+    """Restrict the connection to the files of a folder, without Python objects; None: no files."""
     folders = [] if folder is None else [str(folder), str(folder.absolute())]
     listed = ", ".join(map(literal, folders))
     connection.execute(
@@ -200,13 +199,13 @@ def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None
 
 
 def add_computed_tables(store: Store) -> None:
-    """Let a store's queries name the table macros that Python computes: they are made on demand."""
+    """Register the table macros that Python computes; they are created when a query names them."""
     store.add_tables(("mixture", "mixture_rows"), _install_mixtures)
     store.add_tables(("gaps",), _install_gaps)
 
 
 def _install_mixtures(store: Store) -> None:
-    from restock.replay.panel.mixture_tables import install_mixtures  # few queries name these
+    from restock.replay.panel.mixture_tables import install_mixtures  # rarely needed
 
     install_mixtures(store)
 
@@ -218,10 +217,10 @@ def _install_gaps(store: Store) -> None:
 
 
 def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
-    """Return the panel and the run to query beside a store, each by its kind.
+    """Return kind ("panel" or "run") -> path for places to query together with a store.
 
     Raises:
-        StoreError: a place is neither, or there are two of a kind.
+        StoreError: a place is neither a panel nor a run, or there are two of a kind.
     """
     found: dict[str, Path] = {}
     for place in map(Path, places):
@@ -238,7 +237,7 @@ def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
 
 
 def kind_beside(place: str | Path) -> str | None:
-    """Return whether a place is a panel or a run, by its own file."""
+    """Return "panel" or "run" by the files in a folder; None if it is neither."""
     with suppress(OSError, ValueError):  # a query is too long for a path
         for kind, file in (("panel", "panel.json"), ("run", RUN_CONFIG)):
             if (Path(place) / file).is_file():
@@ -256,9 +255,9 @@ def _add_all(
 
 
 def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> None:
-    """Raise if a run or panel has only recordings that the store lacks.
+    """Raise StoreError if all logged rows of a run or panel are of recordings that the store lacks.
 
-    Recordings' ids depend on their content, so the store may have been moved or copied.
+    Ids of recordings depend only on their content, so a store that was moved or copied passes.
     """
     fed = f"""
         FROM information_schema.tables
@@ -283,7 +282,7 @@ def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> Non
 
 
 def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str | None:
-    """Create the views of a run or a panel; return which it is, or None if it is neither."""
+    """Create the views of a run or a panel; return its kind, or None if it is neither."""
     from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 
     if (path / HEADER).is_file():
@@ -300,7 +299,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
     files = {file.stem: file for file in tables}
     files |= {f"eval_{file.stem}": file for file in sorted(path.glob("eval/*.parquet"))}
     for view, file in files.items():
-        # DuckDB verifies no checksum of a page.
+        # Verifies page checksums, which DuckDB does not.
         read_table(file, error=StoreError, remedy=REMAKE)
         read_parquet(connection, view, [file], schema=schema)
         for field in pq.read_schema(file):
@@ -315,7 +314,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
 
 
 def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: str) -> None:
-    """Create the view `replay_audit` of a run, with the names of its actions."""
+    """Create the view `replay_audit` of a run, and the table of its actions' names."""
     names = read_json(run / RUN_CONFIG, error=RunError).get("actions", [])
     table = {
         "action": pa.array(range(len(names)), pa.int16()),

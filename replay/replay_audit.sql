@@ -1,7 +1,8 @@
--- One row a sampled transition: the replay audit record, over the table `audit` of a run. Its clock is
+-- The replay audit: one row per sampled transition, from the table `audit` of a run. Its clock counts
 -- updates: a row was collected before the last target sync if gradient_step - age_steps < target_sync_step.
--- A fresh row's id is made of its episode and step: negative, so that it is none of a store's.
--- {schema} is the run's; `action_names` has the names of its task's actions, none of an older run.
+-- A fresh row's id is computed from its episode and step. It is negative, so it differs from a store's ids.
+-- {schema} is the run's schema. `action_names` has the names of its task's actions; it is empty for an
+-- older run.
 CREATE VIEW "{schema}".replay_audit AS
 SELECT
     CASE
@@ -20,7 +21,7 @@ SELECT
     batch_row
 FROM (
     FROM "{schema}".audit
-    UNION ALL BY NAME  -- what a run of an earlier Restock lacks is null
+    UNION ALL BY NAME  -- columns that an older run lacks become null
     SELECT
         NULL::BIGINT AS transition_id, NULL::VARCHAR AS source, NULL::VARCHAR AS episode,
         NULL::INTEGER AS episode_step, NULL::BIGINT AS age_gradient_steps, NULL::DOUBLE AS age_days,
@@ -33,20 +34,20 @@ LEFT JOIN "{schema}".action_names USING (action)
 ORDER BY gradient_step, batch_row;
 
 COMMENT ON COLUMN "{schema}".replay_audit.transition_id
-    IS 'of a logged row as in the store; of a fresh row negative: -1 - (episode * 2**20 + step)';
+    IS 'id of a logged row in the store; for a fresh row negative: -1 - (episode * 2**20 + step)';
 COMMENT ON COLUMN "{schema}".replay_audit.age_steps
-    IS 'updates since it was collected; of a logged row since the run began, as it could be drawn from then on';
+    IS 'updates since it was collected; for a logged row, since the run began: it could be drawn from then on';
 COMMENT ON COLUMN "{schema}".replay_audit.age_days
-    IS 'of a logged row: days before training began; null of a fresh one';
+    IS 'days from the logging of the row to the begin of training; null for a fresh row';
 COMMENT ON COLUMN "{schema}".replay_audit.condition
-    IS 'null where the episode of a fresh row had not ended with the run';
-COMMENT ON COLUMN "{schema}".replay_audit.behavior_policy IS 'who acted';
-COMMENT ON COLUMN "{schema}".replay_audit.action IS 'its name; its index in a run of an earlier Restock';
+    IS 'condition of the row; null for a fresh row whose episode had not ended with the run';
+COMMENT ON COLUMN "{schema}".replay_audit.behavior_policy IS 'policy or driver that acted';
+COMMENT ON COLUMN "{schema}".replay_audit.action IS 'name of the action; `action INDEX` in an older run';
 COMMENT ON COLUMN "{schema}".replay_audit.reward IS 'the n-step return of the row';
 COMMENT ON COLUMN "{schema}".replay_audit.target_sync_step
-    IS 'update after which the target network had last moved; null where another library learnt';
+    IS 'update after which the target network last changed; null if another library trained the run';
 COMMENT ON COLUMN "{schema}".replay_audit.source IS 'logs | fresh';
-COMMENT ON COLUMN "{schema}".replay_audit.gradient_step IS 'update whose batch it was in';
-COMMENT ON COLUMN "{schema}".replay_audit.batch_row IS 'its place in the batch: `audit` has more of it';
+COMMENT ON COLUMN "{schema}".replay_audit.gradient_step IS 'update whose batch contained the row';
+COMMENT ON COLUMN "{schema}".replay_audit.batch_row IS 'place in the batch; `audit` has more columns of it';
 COMMENT ON COLUMN "{schema}".action_names.action IS 'index of the discrete action';
-COMMENT ON COLUMN "{schema}".action_names.name IS 'of the action';
+COMMENT ON COLUMN "{schema}".action_names.name IS 'name of the action';

@@ -1,8 +1,8 @@
 """Topics of recordings as tables, decoded while DuckDB reads them, and only if a query names them.
 
-A message is a row: `log_time_ns`, `stamp_ns` if it has a header, then its fields in their order.
-Nested messages are structs, whatever repeats is a list, so `pose.pose.position.x` is written as it
-is. Rows come in the order of the file. In a folder of recordings `file` says which one it is.
+A row is a message: `log_time_ns`, `stamp_ns` if it has a header, then its fields in order. Nested
+messages are structs and repeated fields are lists, so a query can use `pose.pose.position.x`. Rows
+are in the order of the file. For several recordings, the column `file` has each row's path.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ STAMP = "header.stamp"
 
 
 class Topics:
-    """Recordings at a path, whose topics are tables of a connection as long as this object lives.
+    """Recordings whose topics are tables of a connection while this object exists.
 
     Args:
-        connection: gets a table for each topic that a query names, under the topic's name, and
-            under the same without slashes if that is no other table's; `topics` and `columns`
-            list them.
-        path: a recording, a folder of them, or a glob.
-        lost: called with each loss, once: damage, or messages of a topic that was read.
+        connection: gets a table for each topic that a query names. Its name is the topic's, and
+            also the topic's with `_` for inner slashes, if that is unique. The tables `topics` and
+            `columns` list them.
+        path: a recording, a folder of recordings, or a glob.
+        lost: called once for each loss: damage, or lost messages of a topic that was read.
 
     Raises:
-        RecordingError: there is no recording, or none of them can be opened.
+        RecordingError: there is no recording, or none can be opened.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Topics:
         make_on_demand(connection, self)
 
     def make(self, text: str) -> None:
-        """Make the tables that a text names, or all of them if it lists tables."""
+        """Create the tables that a query names, or all tables if it lists tables."""
         lowered = text.lower()
         if set(re.findall(r"\w+", lowered)) & LISTS:
             self.make_all()
@@ -97,12 +97,12 @@ class Topics:
                 self._made.add(name)
 
     def make_all(self) -> None:
-        """Make the table of every topic that can be decoded."""
+        """Create the table of every topic that can be decoded."""
         for view in self._views:
             self._make(view)
 
     def report(self, recording: Recording) -> None:
-        """Report what a recording has lost so far, each loss once."""
+        """Report the losses of a recording so far, each only once."""
         for loss in recording.lost_messages:
             count = "" if loss.messages is None else f" ({counted(loss.messages, 'message')})"
             where = f"{recording.path}: " if self._several else ""
@@ -136,13 +136,13 @@ class Topics:
         self._connection.execute(f"CREATE OR REPLACE VIEW {_quoted(view)} AS {query}")
 
     def _refuse(self, view: str) -> None:
-        """Refuse a query of a topic that cannot be decoded."""
+        """Raise QueryError for a topic that cannot be decoded."""
         topic = self._views[view]
         reasons = [topics[topic][0].skipped for topics in self._files.values() if topic in topics]
         raise QueryError(f"{view} cannot be decoded: {reasons[0]}", where=self.where)
 
     def _list_topics(self) -> pa.Table:
-        """Return each topic of each recording, with its type and its number of messages."""
+        """Return the table `topics`: type and number of messages of each recording's topics."""
         infos = [
             (file, info) for file, topics in self._files.items() for info, _ in topics.values()
         ]
@@ -160,7 +160,7 @@ class Topics:
         return table
 
     def _list_columns(self) -> pa.Table:
-        """Return each field of each topic, as a query writes it, with its type."""
+        """Return the table `columns`: each field of each topic with its DuckDB type."""
         rows = []
         for view, topic in self._views.items():
             leaves = next(topics[topic][1] for topics in self._files.values() if topic in topics)
@@ -176,7 +176,7 @@ class Topics:
 
 
 class _Source:
-    """One topic of one recording, which each scan reads anew: an Arrow stream for DuckDB."""
+    """One topic of one recording as an Arrow stream for DuckDB; each scan reads the file again."""
 
     def __init__(
         self, topics: Topics, file: Path, topic: TopicInfo, leaves: list[Leaf], taken: list[str]
@@ -187,16 +187,16 @@ class _Source:
         self._schema = self._batch(np.zeros(0, np.int64), empty).schema
 
     def __arrow_c_schema__(self) -> object:
-        """Return the columns of the topic."""
+        """Return the schema of the topic's table."""
         return self._schema.__arrow_c_schema__()
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return its messages from the first on."""
+        """Return a stream of all its messages."""
         reader = pa.RecordBatchReader.from_batches(self._schema, self._batches())
         return reader.__arrow_c_stream__()
 
     def _batches(self) -> Iterator[pa.RecordBatch]:
-        """Yield its messages; what is lost is reported at the end, or if a query ends early."""
+        """Yield its messages; losses are reported at the end, or when a query ends early."""
         paths = [leaf.path for leaf in self._leaves]
         try:
             with open_recording(self._file, salvage=True) as recording:
@@ -205,7 +205,7 @@ class _Source:
                         yield self._batch(log_ns, fields)
                 finally:
                     self._topics.report(recording)
-        except RecordingError as error:  # it changed while it was read
+        except RecordingError as error:  # the file changed while it was read
             self._topics._say(f"{self._topic}: {error.what}")
 
     def _batch(self, log_ns: Any, fields: Mapping[str, FieldColumn]) -> pa.RecordBatch:
@@ -220,7 +220,7 @@ class _Source:
 def _members(
     leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int
 ) -> tuple[list[pa.Array], list[str]]:
-    """Return a message's fields as arrays with their names, from the columns of its leaves."""
+    """Return a message's fields as arrays, and their names, from the columns of its leaves."""
     arrays, names = [], []
     pairs = zip(leaves, columns, strict=True)
     for name, group in groupby(pairs, key=lambda pair: pair[0].steps[depth].name):
@@ -231,7 +231,7 @@ def _members(
 
 
 def _field(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -> pa.Array:
-    """Return one field as an array: of lists if it repeats, of structs if it is a message."""
+    """Return one field as an array: of lists if it is repeated, of structs if it is a message."""
     if leaves[0].steps[depth].many:
         first = columns[0]
         rows = len(first)
@@ -261,7 +261,7 @@ def _items(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -
 
 
 def _distinct(names: Iterable[str], taken: Sequence[str] = ()) -> list[str]:
-    """Make names differ for DuckDB, which takes upper and lower case for one and no empty name."""
+    """Make names unique for DuckDB, which ignores case and does not allow empty names."""
     used, given = {name.casefold() for name in taken}, []
     for name in names:
         free = name = name or "_"

@@ -170,7 +170,7 @@ def _of_twin(
         )
         if trace.episode["perturbation"] != "nominal":
             trace.notes.append(
-                f"its perturbation {trace.episode['perturbation']!r} is part of what lays it out"
+                f"its perturbation {trace.episode['perturbation']!r} is needed to generate it again"
             )
 
 
