@@ -190,8 +190,8 @@ def make_algorithm(config: LossConfig) -> Algorithm:
 def _import_named(source: str) -> Callable[[LossConfig], Algorithm]:
     """Import `module:name`, also from the working directory."""
     module, _, name = source.partition(":")
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
     try:
         found: Callable[[LossConfig], Algorithm] = getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
@@ -201,7 +201,7 @@ def _import_named(source: str) -> Callable[[LossConfig], Algorithm]:
             remedy=f"give one of {', '.join(ALGORITHMS)}, or your own as module:name",
         ) from error
     finally:
-        sys.path.remove(here)
+        sys.path.remove(folder)
     return found
 
 

@@ -248,19 +248,19 @@ def moved(shares: F64, wanted: F64, most: float) -> F64:
 
 def unordered(arms: Sequence[MissionArm]) -> list[MissionArm]:
     """Return the arms without those of ordered missions, whose shares go to arms of their kind."""
-    own = [arm for arm in arms if arm.order < 0]
+    kept = [arm for arm in arms if arm.order < 0]
     for order in (arm for arm in arms if arm.order >= 0):
-        total = sum(arm.share for arm in own if arm.kind == order.kind)
+        total = sum(arm.share for arm in kept if arm.kind == order.kind)
         if not total:
-            own.append(MissionArm(order.kind, order.kind, order.share))
+            kept.append(MissionArm(order.kind, order.kind, order.share))
             continue
-        own = [
+        kept = [
             replace(arm, share=arm.share * (1 + order.share / total))
             if arm.kind == order.kind
             else arm
-            for arm in own
+            for arm in kept
         ]
-    return own
+    return kept
 
 
 MISSIONS = "env.missions"

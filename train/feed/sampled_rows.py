@@ -511,21 +511,21 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
     def of_task(by_cell: Ints) -> Ints:
         """Select the pairs that occurred and all actions, (P, A), from (S, C, a) or (S * C, a)."""
         of_pairs = by_cell.reshape(source.pairs, -1)[pairs]
-        none_of = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
-        whole: Ints = np.pad(of_pairs, none_of)[:, :count]
+        padding = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
+        whole: Ints = np.pad(of_pairs, padding)[:, :count]
         return whole
 
     drawn, unique = of_task(source.drawn), of_task(source.unique)
     in_pair = np.repeat(drawn.sum(axis=1), count)
     wanted: dict[str, Any] = {"audited_rows": None, "greedy_rows": None, "greedy_share": None}
     if source.greedy is not None:
-        audited = source.greedy.stratum * size + source.greedy.condition
-        cell = audited * count + source.greedy.action
+        pair = source.greedy.stratum * size + source.greedy.condition
+        cell = pair * count + source.greedy.action
         greedy = of_task(np.bincount(cell, minlength=source.pairs * count))
-        looked_at = np.repeat(greedy.sum(axis=1), count)
-        per_action = zip(greedy.ravel(), looked_at, strict=True)
+        audited = np.repeat(greedy.sum(axis=1), count)
+        per_action = zip(greedy.ravel(), audited, strict=True)
         share = [n / total if total else None for n, total in per_action]
-        wanted = {"audited_rows": looked_at, "greedy_rows": greedy.ravel(), "greedy_share": share}
+        wanted = {"audited_rows": audited, "greedy_rows": greedy.ravel(), "greedy_share": share}
     of_pair = np.repeat(pairs, count)
     return {
         "source": source.name,

@@ -248,8 +248,8 @@ def _import_teacher(source: str) -> Any:
             remedy="to be able to continue a run, start it with a teacher given as module:name",
         )
     module, _, name = source.partition(":")
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
@@ -262,7 +262,7 @@ def _import_teacher(source: str) -> Any:
     except (Exception, SystemExit) as error:
         raise _teacher_error(f"importing {source}", None, error) from error
     finally:
-        sys.path.remove(here)
+        sys.path.remove(folder)
 
 
 _MAX_MEASURED = 128  # rows per condition
