@@ -55,7 +55,7 @@ from restock.train.twin.physics.perturbation import (
     Perturbation,
     Schedule,
     find_perturbation,
-    is_schedule,
+    schedule_error,
 )
 
 if TYPE_CHECKING:
@@ -309,7 +309,7 @@ def _perturb(name: str) -> Perturbation | None:
         return None
     perturbation = find_perturbation(name, where="--perturbations")
     if isinstance(perturbation, Schedule):
-        raise is_schedule(name)
+        raise schedule_error(name)
     if perturbation.timestep_s != Perturbation().timestep_s:
         raise ConfigError(
             f"is for a timestep of {perturbation.timestep_s:g} s, but the evaluation runs at "

@@ -148,7 +148,7 @@ class Handover:
         """Return the actions of each robot's current driver, and their probabilities."""
         if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)
-        self._watch(env)
+        self._choose_drivers(env)
         action, probability = self.planner.act(env, observation)
         if self._by_operator.any():
             operator_action, operator_probability = self.operator.act(env, observation)
@@ -160,7 +160,7 @@ class Handover:
         self.acting_version = np.where(self._by_operator, versions[1], versions[0]).astype("U16")
         return action, probability
 
-    def _watch(self, env: WarehouseVectorEnv) -> None:
+    def _choose_drivers(self, env: WarehouseVectorEnv) -> None:
         """Decide for each robot who drives."""
         signals = env.signals
         begun = env.steps == 0
@@ -202,7 +202,7 @@ PERSON_MARGIN_M = 0.4  # to people who move
 STANDING_MARGIN_M = 0.2  # to people who stand
 
 
-def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> tuple[F64, F64]:
+def simulate(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> tuple[F64, F64]:
     """Predict poses (n, A, T, 3) and speeds (n, A, T) of robots under commands (n, A, T, 2)."""
     period = env.task.control_period_s
     shape = commands.shape[:3]
@@ -362,7 +362,7 @@ class Operator(SoftPolicy, Stateful):
         horizon = steps_of(env, HORIZON_S)
         touch_m, roomy_m = margins_of(env)
         held = np.broadcast_to(table[:, None], (count, actions, horizon, 2))
-        ends, speed = simulated(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
+        ends, speed = simulate(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
         room, people = room_of(env, everyone, ends)  # (N, A, T)
         people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # people stop before it
         arrived = self._arrived(env, everyone, ends)
@@ -389,12 +389,12 @@ class Operator(SoftPolicy, Stateful):
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
         tries[:, table[:, 0] < 0] += 1.0
-        stood = self._standing(env, pose) & (alone | (self._still > steps_of(env, PATIENCE_S)))
-        score[stood] = tries[stood]
-        self._note_stuck(env, pose, np.flatnonzero(stood & alone & ~icy & (self._still > 0)))
+        backs = self._backing_off(env, pose) & (alone | (self._still > steps_of(env, PATIENCE_S)))
+        score[backs] = tries[backs]
+        self._note_stuck(env, pose, np.flatnonzero(backs & alone & ~icy & (self._still > 0)))
         action = np.asarray(score.argmax(axis=1), np.int64)
         ids = self._near_pallets(env, pose)
-        ids = ids[~stood[ids] & alone[ids] & ~icy[ids]]
+        ids = ids[~backs[ids] & alone[ids] & ~icy[ids]]
         if len(ids):
             action[ids] = self._past_pallets(env, ids, pose[ids], table)
         return action
@@ -410,7 +410,7 @@ class Operator(SoftPolicy, Stateful):
         pairs = np.where(np.arange(horizon) < begun, first[:, None], then[:, None])  # (P, T)
         plans = np.broadcast_to(pairs, (len(ids), *pairs.shape))
         plans = np.concatenate([plans, self._plan[ids][:, None]], axis=1)  # (n, P + 1, T)
-        ends, _ = simulated(env, ids, pose, table[plans])
+        ends, _ = simulate(env, ids, pose, table[plans])
         room, people = room_of(env, ids, ends)
         room = np.minimum(room, people)
         arrived = self._arrived(env, ids, ends)
@@ -507,7 +507,7 @@ class Operator(SoftPolicy, Stateful):
         at_goal = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
         return np.asarray(np.logical_or.accumulate(at_goal, axis=2), np.bool_)
 
-    def _standing(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
+    def _backing_off(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
         """Return the robots (N,) that back off: they do so for some time after being stuck.
 
         Robots that wait for people back off only after `PATIENCE_S`.
@@ -515,7 +515,7 @@ class Operator(SoftPolicy, Stateful):
         near = _somebody_near(env, pose)
         let_pass = self._waiting & ~near
         self._waiting = near
-        moved = (np.abs(pose - self._anchor) > _moved(env)).any(axis=1) | (env.steps == 0)
+        moved = (np.abs(pose - self._anchor) > _movement_limits(env)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
         self._still = np.where(moved | let_pass, 0, self._still + 1)
         least, most = (steps_of(env, seconds) for seconds in BACK_S)
@@ -576,7 +576,7 @@ def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:
     return np.asarray(near.any(axis=1), np.bool_)
 
 
-def _moved(env: WarehouseVectorEnv) -> F64:
+def _movement_limits(env: WarehouseVectorEnv) -> F64:
     """Return the changes of x, y (m) and yaw (rad) above which a robot counts as moving.
 
     They are scaled down for slow robots by their highest speeds: else a robot that creeps, or that

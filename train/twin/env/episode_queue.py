@@ -59,7 +59,7 @@ class MissionOrders:
     ) -> None:
         self.orders, self._floors, self._planners = list(orders), list(floors), list(planners)
         self._where = where
-        self._on = [self._fitting(number, order) for number, order in enumerate(orders)]
+        self._on = [self._find_floors(number, order) for number, order in enumerate(orders)]
         amounts = np.array([float(order.missions or 0) for order in orders])
         self.shares = amounts / amounts.sum()
 
@@ -93,7 +93,7 @@ class MissionOrders:
         points = (plan[:-1] + along * (plan[1:] - plan[:-1])).reshape(-1, 2)
         return floor.zone in warehouse.zone_of(points[:, 0], points[:, 1])
 
-    def _fitting(self, number: int, order: MissionOrder) -> list[_Floor]:
+    def _find_floors(self, number: int, order: MissionOrder) -> list[_Floor]:
         where = f"{self._where}, missions[{number}]"
         if order.kind is None or order.missions is None:
             raise ConfigError(
@@ -112,7 +112,7 @@ class MissionOrders:
             raise ConfigError(
                 f"the floor {order.layout!r} is not among the floors of this run",
                 where=where,
-                remedy=f"they are {_some(names)}: choose one of these, or add that floor "
+                remedy=f"they are {_list_some(names)}: choose one of these, or add that floor "
                 "(`layouts`)",
             )
         chosen = [
@@ -121,28 +121,28 @@ class MissionOrders:
             if order.layout in (None, floor.name)
         ]
         if order.zone is not None:
-            fitting = [_Floor(place, _zone_on(floor, order.zone)) for place, floor in chosen]
-            fitting = [one for one in fitting if one.zone is not None]
+            fitting = [_Floor(place, _find_zone(floor, order.zone)) for place, floor in chosen]
+            fitting = [entry for entry in fitting if entry.zone is not None]
             if not fitting:
                 zones = dict.fromkeys(zone for _, floor in chosen for zone in floor.zones)
                 raise ConfigError(
                     f"no floor of this run has a zone {order.zone!r}",
                     where=where,
-                    remedy=f"the zones are {_some(list(zones))}",
+                    remedy=f"the zones are {_list_some(list(zones))}",
                 )
         else:
             fitting = [_Floor(place, None) for place, _ in chosen]
-        refuse_unfit([self._floors[one.place] for one in fitting], [order.kind])
+        refuse_unfit([self._floors[entry.place] for entry in fitting], [order.kind])
         return fitting
 
 
-def _zone_on(floor: Warehouse, zone: str) -> str | None:
+def _find_zone(floor: Warehouse, zone: str) -> str | None:
     """Return a zone's name on a floor, also if given as `FLOOR/ZONE`; None without such a zone."""
-    bare = zone.removeprefix(f"{floor.name}/")
-    return bare if bare in floor.zones else None
+    name = zone.removeprefix(f"{floor.name}/")
+    return name if name in floor.zones else None
 
 
-def _some(names: list[Any]) -> str:
+def _list_some(names: list[Any]) -> str:
     return ", ".join(map(str, names[:12])) + (", …" if len(names) > 12 else "")
 
 
@@ -187,7 +187,7 @@ class MissionArms:
             arm
             for kind, part in conditions.items()
             if left * part  # a kind whose share is 0 is evaluated, but never practised
-            for arm in self._by_block(MissionArm(kind, kind, left * part / total))
+            for arm in self._split_by_block(MissionArm(kind, kind, left * part / total))
         ]
         if orders is not None:
             arms += [
@@ -227,16 +227,16 @@ class MissionArms:
         place = floor_place(spec, self._place)
         return draw_episode(spec, self._floors[place], self._planners[place]).block
 
-    def _by_block(self, arm: MissionArm) -> list[MissionArm]:
+    def _split_by_block(self, arm: MissionArm) -> list[MissionArm]:
         if not MISSIONS[arm.kind].blocks:
             return [arm]
-        found = self._blocks(arm.kind)
+        found = self._find_blocks(arm.kind)
         return [
             replace(arm, name=f"{arm.name} ({block})", block=block, share=arm.share / len(found))
             for block in found
         ]
 
-    def _blocks(self, kind: str) -> list[str]:
+    def _find_blocks(self, kind: str) -> list[str]:
         """Return the blocks of a kind that the floors have room for."""
         found: set[str] = set()
         blocks = list(MISSIONS[kind].blocks)
@@ -307,7 +307,7 @@ class EpisodeQueue(Stateful):
         self.next_fixed = 0
         self._orders: MissionOrders | None = None
         self._orders_share = 0.0
-        self._asked: MissionArms | None = None  # the last that `arms` returned
+        self._offered: MissionArms | None = None  # the last that `arms` returned
         self._arms: MissionArms | None = None  # that episodes are drawn from
         self._arm_shares = np.zeros(0)  # cumulative
         self.set_conditions(conditions)
@@ -336,11 +336,11 @@ class EpisodeQueue(Stateful):
     def practise(self, shares: Sequence[float]) -> None:
         """Draw episodes of the last `arms` from now on, in these shares."""
         parts = np.asarray(shares, np.float64)
-        self._arms, self._arm_shares = self._asked, np.cumsum(parts) / parts.sum()
+        self._arms, self._arm_shares = self._offered, np.cumsum(parts) / parts.sum()
 
     def arms(self, planners: Sequence[Planner]) -> list[MissionArm]:
         """Return the arms that its episodes can be drawn from."""
-        self._asked = MissionArms(
+        self._offered = MissionArms(
             self._layouts,
             planners,
             self.conditions,
@@ -348,7 +348,7 @@ class EpisodeQueue(Stateful):
             orders=self._orders,
             orders_share=self._orders_share,
         )
-        return self._asked.arms
+        return self._offered.arms
 
     def restored(self) -> None:
         """Recompute the cumulative shares after a state was restored."""
@@ -370,12 +370,12 @@ class EpisodeQueue(Stateful):
         self.drawn[env] += 1
         seed = int(draw[1]) << 20 ^ int(draw[2])
         if self._arms is not None:
-            arm = _drawn(self._arm_shares, draw[0])
+            arm = _draw_index(self._arm_shares, draw[0])
             return self._arms.spec(arm, seed), -1, arm
         if self._orders is not None and draw[3] / 2**32 < self._orders_share:
-            spec = self._orders.spec(_drawn(np.cumsum(self._orders.shares), draw[4]), seed)
+            spec = self._orders.spec(_draw_index(np.cumsum(self._orders.shares), draw[4]), seed)
         else:
-            spec = EpisodeSpec(KINDS[_drawn(self._cumulative, draw[0])], seed)
+            spec = EpisodeSpec(KINDS[_draw_index(self._cumulative, draw[0])], seed)
         return perturbed(spec, self.schedule), -1, -1
 
     def floor_of(self, spec: EpisodeSpec) -> int:
@@ -383,7 +383,7 @@ class EpisodeQueue(Stateful):
         return floor_place(spec, self._floors)
 
 
-def _drawn(cumulative: F64, draw: np.integer[Any]) -> int:
+def _draw_index(cumulative: F64, draw: np.integer[Any]) -> int:
     """Return the index of the share, of cumulative shares, that 32 random bits fall into."""
     place = int(np.searchsorted(cumulative, draw / 2**32, side="right"))
     return min(place, len(cumulative) - 1)  # their sum may fall short of 1 by rounding

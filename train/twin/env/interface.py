@@ -90,25 +90,25 @@ def epsilon_greedy(
     return action, probability.astype(np.float32)
 
 
-class MadeAgain:
+class PickledByArguments:
     """A base class whose objects are pickled by their constructor's arguments, like EzPickle.
 
     The copy has the same settings and is not reset yet; the state of the original is not copied.
     """
 
     spec: Any  # Gymnasium's EnvSpec, set by `gymnasium.make`
-    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Keep the constructor's arguments."""
-        made = super().__new__(cls)
-        made._made_of = given, named
-        return made
+        copy = super().__new__(cls)
+        copy._arguments = given, named
+        return copy
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the class and its arguments for pickle and copy."""
-        return _make_again, (type(self), *self._made_of), {"spec": self.spec}
+        return _construct, (type(self), *self._arguments), {"spec": self.spec}
 
 
-def _make_again(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) -> Any:
+def _construct(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) -> Any:
     return kind(*given, **named)

@@ -216,9 +216,9 @@ class Navigation(Stateful):
 
         The step's progress is computed before this, so that a new plan never makes it jump.
         """
-        again = set((offset_m > STRAYED_M).nonzero()[0].tolist())
-        again |= self._find_blocks(signals, sensing)
-        for env in again:
+        replanned = set((offset_m > STRAYED_M).nonzero()[0].tolist())
+        replanned |= self._find_blocks(signals, sensing)
+        for env in replanned:
             self.plans_m[env] = self.planner_of(env).plan(
                 float(signals["pose_x_m"][env]),
                 float(signals["pose_y_m"][env]),
@@ -226,8 +226,8 @@ class Navigation(Stateful):
                 self.closures[env],
             )
             self.plan_number[env] += 1
-        if again:
-            ids = np.array(sorted(again), np.int64)
+        if replanned:
+            ids = np.array(sorted(replanned), np.int64)
             rows: Signals = {name: column[ids] for name, column in signals.items()}
             self.add_route(rows, ids)
             for name, column in rows.items():
@@ -306,7 +306,7 @@ class PathFollower:
         self._behind = np.r_[0:half, task.sectors - half : task.sectors]
         # Rows: fast, slow; columns: straight on, to the left, to the right.
         bends = [((1.0, 0.0), (0.8, 0.7), (0.8, -0.7)), ((0.4, 0.0), (0.35, 0.6), (0.35, -0.6))]
-        self._drive = np.array([[self._index(*one) for one in row] for row in bends])
+        self._drive = np.array([[self._index(*velocity) for velocity in row] for row in bends])
         self._pivot = np.array([0, self._index(0.0, 1.2), self._index(0.0, -1.2)])
         # A robot that steers has no action that turns on the spot: it turns in several moves.
         self._steers = not (self.table[:, 1] != 0)[self.table[:, 0] == 0].any()
@@ -325,11 +325,11 @@ class PathFollower:
         action = self._drive[(slow | careful).astype(np.intp), np.where(bend > 0.12, side, 0)]
         action[front < self.stop_m] = 0
         if self._steers:
-            return self._turned_in_moves(signals, action, front, bend, side)
+            return self._turn_in_moves(signals, action, front, bend, side)
         pivot = (bend > 0.9) & ~(signals["clearance_m"] <= self.pivot_m)  # NaN: not known
         return np.where(pivot, self._pivot[side], action)
 
-    def _turned_in_moves(
+    def _turn_in_moves(
         self, signals: Signals, action: Ints, front: F64, bend: F64, side: Ints
     ) -> Ints:
         """Return the actions (N,) of steered robots that turn by driving forward and back.
@@ -372,7 +372,7 @@ def _corner_m(body: Body) -> float:
 
 
 AFTERMATH = "recovery"
-SCORED = {one.name: one.is_true for one in MISSIONS.values() if one.is_true is not None}
+SCORED = {kind.name: kind.is_true for kind in MISSIONS.values() if kind.is_true is not None}
 NAMES = (*SCORED, AFTERMATH)
 EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
 

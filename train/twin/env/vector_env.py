@@ -41,7 +41,7 @@ from restock.ingest.task.task_sql import Past, Table
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful, saved
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
-from restock.train.twin.env.interface import Info, MadeAgain, Step
+from restock.train.twin.env.interface import Info, PickledByArguments, Step
 from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
 from restock.train.twin.env.render import draw_map
 from restock.train.twin.floors.floors import open_floors
@@ -123,7 +123,7 @@ ACTIONS: Mapping[str, type[DiscreteActions | ContinuousActions]] = {
 }
 
 
-def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
+def limit_actions(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
     """Limit the chosen actions; `info["limiter"]` is the rule that limited each.
 
     A limited command gets the table's nearest action, as ingest would label its log.
@@ -141,7 +141,7 @@ def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> 
 OBSERVATION_LIMIT = 20.0  # bounds of the space, which clip observations; sensors give less
 
 
-class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, MadeAgain):
+class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, PickledByArguments):
     """N warehouses as a Gymnasium vector environment; `docs/twin.md` explains `info`."""
 
     # What changes while episodes run; the rest (layout, noise, traffic's paths) follows from specs.
@@ -304,7 +304,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         if OBSERVED in self.past:
             first[OBSERVED] = self.past[OBSERVED].now(ids)
         observed = observe(self.task, first, first, self.previous_action[ids])
-        self.observation[ids] = _bounded(observed)
+        self.observation[ids] = _bound(observed)
         if self.signals:
             for name, column in self.signals.items():
                 column[ids] = first[name]
@@ -363,7 +363,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         now, sim, task = self.signals, self.simulation, self.task
         chosen = self._actions.read(actions)
         if self.limits is not None:
-            chosen = behind_limiter(self.limits, task, now, chosen)
+            chosen = limit_actions(self.limits, task, now, chosen)
         action, command, reported = chosen
         everyone = np.arange(self.num_envs)
         sim.drive(command)
@@ -389,7 +389,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
-        observed = _bounded(observe(task, after, now, action))
+        observed = _bound(observe(task, after, now, action))
         truth = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
         info = info_after(self, after, progress, truth, terminated) | reported
         if invalid.any():
@@ -455,12 +455,12 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         super().load_state_dict(state)
 
 
-def _bounded(observation: F32) -> F32:
+def _bound(observation: F32) -> F32:
     known = np.where(np.isnan(observation), np.float32(0.0), observation)
     return known.clip(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
+class WarehouseEnv(gymnasium.Env[F32, Any], PickledByArguments):
     """The vector environment with N = 1; `info` holds its values without the leading axis.
 
     It takes the vector environment's keyword arguments. The vector environment is `self.vector`.

@@ -100,7 +100,7 @@ def read_floor(path: Path) -> Warehouse:
     """
     remedy = "docs/layouts.md lists the keys of a floor"
     content = typed(read_toml(path), FloorFile, where=str(path), remedy=remedy)
-    bare = Warehouse(
+    floor = Warehouse(
         width_m=content.width_m,
         depth_m=content.depth_m,
         racks=tuple(Rect(*box) for box in content.racks),
@@ -115,7 +115,7 @@ def read_floor(path: Path) -> Warehouse:
         way_m=content.way_m,
         starts_m=tuple(content.starts),
     )
-    free = cells_of(bare, CELL_M)
+    free = cells_of(floor, CELL_M)
     segments = (
         find_segments(free, CELL_M)
         if content.aisles is None
@@ -131,7 +131,7 @@ def read_floor(path: Path) -> Warehouse:
         if content.goals is None
         else tuple((x, y) for x, y in content.goals)
     )
-    return replace(bare, segments=segments, crossings=crossings, goals_m=goals)
+    return replace(floor, segments=segments, crossings=crossings, goals_m=goals)
 
 
 def floor_toml(floor: Warehouse, remarks: Sequence[str] = ()) -> str:

@@ -111,22 +111,22 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
         Dock(f"dock_{index + 1}", Rect(0.0, round(y - 0.4, 3), 1.2, round(y + 0.4, 3)))
         for index, y in enumerate(between)
     )
-    ruled = rng.random() < recipe.one_way
+    has_rules = rng.random() < recipe.one_way
     first = int(rng.integers(2))
-    made = strip_warehouse(
+    floor = strip_warehouse(
         width, depth, aisle_y, cross_x, name=name, docks=docks, open_racks=missing
     )
-    if ruled:
+    if has_rules:
         ways: tuple[Heading, Heading] = ("east", "west")
-        made = replace(
-            made,
+        floor = replace(
+            floor,
             one_way=tuple(
                 OneWay(segment.area, ways[(segment.aisle + first) % 2])
-                for segment in made.segments
+                for segment in floor.segments
                 if 0 < segment.aisle < aisles - 1
             ),
         )
-    return transposed(made) if rng.random() < recipe.turned else made
+    return transposed(floor) if rng.random() < recipe.turned else floor
 
 
 def _strips(
@@ -220,7 +220,7 @@ def _open(text: str) -> list[Warehouse]:
         return [default_warehouse()]
     kind, _, rest = text.partition(":")
     if kind in RECIPES:
-        return [_generated(kind, seed) for seed in _seeds(text, rest)]
+        return [_generated(kind, seed) for seed in _parse_seeds(text, rest)]
     suffix = Path(text).suffix.lower()
     if suffix == ".toml":
         from restock.train.twin.floors.floor_files import read_floor
@@ -238,7 +238,7 @@ def _open(text: str) -> list[Warehouse]:
     )
 
 
-def _seeds(text: str, rest: str) -> list[int]:
+def _parse_seeds(text: str, rest: str) -> list[int]:
     first, _, last = rest.partition(":")
     if first in SPLITS:
         size = int(last) if last.isdecimal() and len(last) < 6 else (0 if last else FLOORS)

@@ -171,10 +171,10 @@ class Warehouse:
 
     def __post_init__(self) -> None:
         """Raise ConfigError if the numbers do not make a floor."""
-        if wrong := self._wrong():
-            raise ConfigError(wrong[0], where=f"layout {self.name}", remedy=wrong[1])
+        if problem := self._find_problem():
+            raise ConfigError(problem[0], where=f"layout {self.name}", remedy=problem[1])
 
-    def _wrong(self) -> tuple[str, str] | None:
+    def _find_problem(self) -> tuple[str, str] | None:
         """Return what is wrong with the numbers, and the remedy; None if they make a floor."""
         size = f"0 to {self.width_m:g} m by 0 to {self.depth_m:g} m"
         for side in (self.width_m, self.depth_m):
@@ -215,8 +215,8 @@ class Warehouse:
     def starts(self) -> tuple[AisleSegment, ...]:
         """Return the areas where episodes begin: known starts, else aisle segments, else goals."""
         if self.starts_m:
-            here = (Rect(x - 0.46, y - 0.46, x + 0.46, y + 0.46) for x, y in self.starts_m)
-            return tuple(AisleSegment("start", 0, area) for area in here)
+            areas = (Rect(x - 0.46, y - 0.46, x + 0.46, y + 0.46) for x, y in self.starts_m)
+            return tuple(AisleSegment("start", 0, area) for area in areas)
         around = (Rect(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for x, y in self.goals.tolist())
         return self.segments or tuple(AisleSegment("start", 0, area) for area in around)
 

@@ -101,13 +101,13 @@ def with_missions(
     If the visited places are all close together, missions also go to places in `elsewhere`.
     """
     near = connected(floor)
-    ways = _ways(near)
-    made = _long_as(near, *ways)
+    ways = _measure_routes(near)
+    made = _with_lengths(near, *ways)
     longest_m = made.way_m[1] if len(ways[0]) else 0.0
     if longest_m >= NEAR_M or not elsewhere:
         return made
     step = max(len(elsewhere) // PLACES, 1)
-    wider = missions_way(connected(replace(floor, goals_m=floor.goals_m + elsewhere[::step])))
+    wider = fit_lengths(connected(replace(floor, goals_m=floor.goals_m + elsewhere[::step])))
     if wider.way_m[1] < 1.5 * longest_m or not wider.starts_m:
         return made
     notes.append(
@@ -118,12 +118,12 @@ def with_missions(
     return wider
 
 
-def missions_way(floor: Warehouse) -> Warehouse:
+def fit_lengths(floor: Warehouse) -> Warehouse:
     """Return the floor with mission lengths that its places allow: the usual ones if possible."""
-    return _long_as(floor, *_ways(floor))
+    return _with_lengths(floor, *_measure_routes(floor))
 
 
-def _ways(floor: Warehouse) -> tuple[F64, F64]:
+def _measure_routes(floor: Warehouse) -> tuple[F64, F64]:
     """Return the lengths and costs (N,), in metres, of routes that are long enough for missions."""
     planner = Planner(floor, trees_kept=1)
     starts = [segment.area.center for segment in floor.starts]
@@ -139,7 +139,7 @@ def _ways(floor: Warehouse) -> tuple[F64, F64]:
     return np.array(lengths), np.array(costs)
 
 
-def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
+def _with_lengths(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
     """Return the floor with these lengths for missions, unless usual lengths are common enough."""
     if not len(length):
         return floor
@@ -266,20 +266,20 @@ def floor_of_grid(
         ConfigError: no such part exists, it is too large, or obstacles are too ragged for boxes.
     """
     notes: list[str] = []
-    grid = _bounded(grid, where, visited_m, notes)
-    drivable = drivable_part(grid.free, grid.cell_m, room_m, _cells_in(grid, visited_m))
+    grid = _limit_size(grid, where, visited_m, notes)
+    drivable = drivable_part(grid.free, grid.cell_m, room_m, _visited_cells(grid, visited_m))
     if not drivable.any():
-        raise ConfigError(_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
+        raise ConfigError(_explain_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
     # The part also has the free cells around those that the robot's middle can be in.
     near = ndimage.distance_transform_edt(~drivable) * grid.cell_m <= 1.5 * room_m + grid.cell_m
     free = grid.free & near
     columns, rows = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
     window = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
     grid, free = grid.cut(*map(int, window)), free[window[0] : window[1], window[2] : window[3]]
-    free, cell_m, racks = _racks(free, grid.cell_m, where, notes)
-    reachable = drivable_part(free, cell_m, room_m, _cells_in(grid, visited_m, cell_m))
+    free, cell_m, racks = _cover_obstacles(free, grid.cell_m, where, notes)
+    reachable = drivable_part(free, cell_m, room_m, _visited_cells(grid, visited_m, cell_m))
     if not reachable.any():
-        raise ConfigError(_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
+        raise ConfigError(_explain_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
     segments = tuple(
         segment
         for segment in find_segments(free, cell_m)
@@ -316,7 +316,7 @@ def floor_of_grid(
     if places:
         floor = with_missions(floor, elsewhere, notes)
     elif visited_m is not None:
-        floor = missions_way(connected(floor))
+        floor = fit_lengths(connected(floor))
     return GridFloor(floor, grid, notes)
 
 
@@ -325,7 +325,7 @@ _NO_ROOM_REMEDY = (
 )
 
 
-def _no_room(grid: OccupancyGrid, room_m: float) -> str:
+def _explain_no_room(grid: OccupancyGrid, room_m: float) -> str:
     free, size = int(grid.free.sum()), grid.occupancy.size
     unknown = int((grid.occupancy == UNKNOWN).sum())
     what = f"has no free place that a robot fits in: {free:,} of {size:,} cells are free"
@@ -340,7 +340,7 @@ def _no_room(grid: OccupancyGrid, room_m: float) -> str:
     return what
 
 
-def _bounded(
+def _limit_size(
     grid: OccupancyGrid, where: str, visited_m: F64 | None, notes: list[str]
 ) -> OccupancyGrid:
     """Cut a grid that is too large for a floor to where the robot drove, and make it coarser."""
@@ -354,7 +354,7 @@ def _bounded(
             before = grid
             grid = grid.cut(int(low[0]), int(high[0]), int(low[1]), int(high[1]))
             notes.append(
-                f"cut from {_metres(before)} to {_metres(grid)}: {_AROUND_M:g} m around where the"
+                f"cut from {_extent(before)} to {_extent(grid)}: {_AROUND_M:g} m around where the"
                 " robot drove"
             )
     fine = grid
@@ -364,7 +364,7 @@ def _bounded(
         notes.append(f"{fine.occupancy.size:,} cells were made coarser, {grid.cell_m:g} m each")
     if grid.occupancy.size > _MANY_CELLS:
         raise ConfigError(
-            f"its {fine.occupancy.size:,} cells are {_metres(fine)}: a floor has a side of at most"
+            f"its {fine.occupancy.size:,} cells are {_extent(fine)}: a floor has a side of at most"
             f" {MAX_SIDE_M:g} m",
             where=where,
             remedy="cut the map to the part that the robots drive in",
@@ -372,12 +372,12 @@ def _bounded(
     return grid
 
 
-def _metres(grid: OccupancyGrid) -> str:
+def _extent(grid: OccupancyGrid) -> str:
     sides = (f"{size * grid.cell_m:.0f}" for size in grid.occupancy.shape)
     return " x ".join(sides) + " m"
 
 
-def _cells_in(
+def _visited_cells(
     grid: OccupancyGrid, visited_m: F64 | None, cell_m: float | None = None
 ) -> NDArray[np.int64] | None:
     """Return the cells (N, 2), of size `cell_m`, that the robot was in, even cells off the grid."""
@@ -386,7 +386,7 @@ def _cells_in(
     return np.floor(grid.within(visited_m) / (cell_m or grid.cell_m)).astype(np.int64)
 
 
-def _racks(
+def _cover_obstacles(
     free: Cells, cell_m: float, where: str, notes: list[str]
 ) -> tuple[Cells, float, tuple[Rect, ...]]:
     """Cover obstacles with at most MAX_RACKS boxes, on coarser (never freer) cells if needed."""

@@ -103,13 +103,13 @@ def logged_drives(
             clearance_m = clearances_of(task, np.stack(list(seen[0])))
             drives[recording] = drive_of(task, poses, clearance_m)
         else:
-            drives[recording] = Drive(_known(poses)[:, :2], np.empty((0, 2)))
+            drives[recording] = Drive(_drop_unknown(poses)[:, :2], np.empty((0, 2)))
     return drives
 
 
 def drive_of(task: Task, poses: F64, clearance_m: F64) -> Drive:
     """Build a drive from poses (N, 3) and the clearances (N, K) seen there, without NaN poses."""
-    clearance_m, poses = clearance_m[np.isfinite(poses).all(axis=1)], _known(poses)
+    clearance_m, poses = clearance_m[np.isfinite(poses).all(axis=1)], _drop_unknown(poses)
     x, y = sector_returns(task, clearance_m)
     cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     returns = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + poses[:, None, :2]
@@ -117,5 +117,5 @@ def drive_of(task: Task, poses: F64, clearance_m: F64) -> Drive:
     return Drive(poses[:, :2], seen[:: len(seen) // RETURNS + 1])
 
 
-def _known(poses: F64) -> F64:
+def _drop_unknown(poses: F64) -> F64:
     return poses[np.isfinite(poses).all(axis=1)]

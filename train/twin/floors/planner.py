@@ -50,7 +50,7 @@ class Planner:
         )
         self._clearance_m = _rack_clearance(self.warehouse, self.shape)
         self._graph = self._build_graph(self._clearance_m)
-        self._unruled = (
+        self._rule_free = (
             Planner(replace(self.warehouse, one_way=()), max(self.trees_kept // 8, 8))
             if self.warehouse.one_way
             else None
@@ -70,10 +70,10 @@ class Planner:
         place, the plan ignores them.
         """
         cell = self.cell(x_m, y_m)
-        if self._unruled is not None and self._clearance_m.flat[cell] >= self.warehouse.room_m:
+        if self._rule_free is not None and self._clearance_m.flat[cell] >= self.warehouse.room_m:
             ruled = self._tree(self.cell(*goal), tuple(sorted(closures)))[0]
             if not np.isfinite(ruled[cell]):
-                return self._unruled.plan(x_m, y_m, goal, closures)
+                return self._rule_free.plan(x_m, y_m, goal, closures)
         for kept in range(len(closures), -1, -1):
             distance, before = self._tree(self.cell(*goal), tuple(sorted(closures[:kept])))
             start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
@@ -125,10 +125,10 @@ class Planner:
             clearance = np.minimum(clearance, gap)
         graph = self._build_graph(clearance)
         cell = self.cell(x_m, y_m)
-        if self._unruled is None or clearance.flat[cell] < self.warehouse.room_m:
+        if self._rule_free is None or clearance.flat[cell] < self.warehouse.room_m:
             return graph
         distance = csgraph.dijkstra(graph, indices=self.cell(*goal))
-        return graph if np.isfinite(distance[cell]) else self._unruled._build_graph(clearance)
+        return graph if np.isfinite(distance[cell]) else self._rule_free._build_graph(clearance)
 
     def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
         """Follow the tree from a cell to the goal; return the path smoothed and resampled."""
@@ -207,7 +207,7 @@ class Planner:
         near = np.clip((wide - clearance_m) / (wide - room), 0.0, 1.0)
         cost = 1.0 + NEAR_COST * near**2
         index = np.arange(free.size).reshape(self.shape)
-        against = self._against_rules()
+        rules = self._find_ruled_cells()
         forth: list[tuple[NDArray[Any], ...]] = []  # from, to, weight
         back: list[tuple[NDArray[Any], ...]] = []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
@@ -218,14 +218,14 @@ class Planner:
             length = CELL_M * np.hypot(di, dj)
             weight = length * (cost[cells][both] + cost[neighbours][both]) / 2
             # Edge one -> other is for a robot that drives from `other` to `one`, by (-di, -dj).
-            kept = _allowed(against, (-di, -dj), one, other)
+            kept = _find_allowed(rules, (-di, -dj), one, other)
             forth.append((one[kept], other[kept], weight[kept]))
-            kept = _allowed(against, (di, dj), one, other)
+            kept = _find_allowed(rules, (di, dj), one, other)
             back.append((other[kept], one[kept], weight[kept]))
         row, column, value = map(np.concatenate, zip(*forth, *back, strict=True))
         return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
 
-    def _against_rules(self) -> list[tuple[tuple[int, int], Bools]]:
+    def _find_ruled_cells(self) -> list[tuple[tuple[int, int], Bools]]:
         """Return each one-way rule's heading, and a mask (size,) of the cells where it holds."""
         x, y = _cell_middles(self.shape)
         rules = []
@@ -236,7 +236,7 @@ class Planner:
         return rules
 
 
-def _allowed(
+def _find_allowed(
     rules: list[tuple[tuple[int, int], Bools]],
     step: tuple[int, int],
     one: Ints,

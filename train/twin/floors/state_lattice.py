@@ -205,20 +205,20 @@ def lattice_around(
     `graph` (from `Planner.graph_around`) connects the floor's cells past the boxes, in metres,
     against the robot's direction. It is used outside the window.
     """
-    room = _room(floor, boxes, half_m, window, motion.outline_m)
+    room = _find_room(floor, boxes, half_m, window, motion.outline_m)
     free = room > TOUCH_M
     cost = 1.0 + NEAR_COST * np.clip(1.0 - room / NEAR_M, 0.0, 1.0)
-    edges = [_outside(graph, window, motion), _inside(free, cost, motion, graph.shape[0])]
+    edges = [_outer_edges(graph, window, motion), _inner_edges(free, cost, motion, graph.shape[0])]
     edges += [
-        _across(free, window, motion, graph.shape[0]),
-        _arrivals(free, window, goal, goal_radius_m),
+        _border_edges(free, window, motion, graph.shape[0]),
+        _goal_edges(free, window, goal, goal_radius_m),
     ]
     from_, to, time_s = (np.concatenate(parts) for parts in zip(*edges, strict=True))
     nodes = graph.shape[0] + free.size + 1
     joined = sparse.csr_matrix((time_s, (to, from_)), shape=(nodes, nodes))
     times, before = csgraph.dijkstra(joined, indices=nodes - 1, return_predecessors=True)
     times = times[graph.shape[0] : -1].reshape(free.shape)
-    filled = np.stack([_filled(times[..., k]) for k in range(len(STEPS))], axis=-1)
+    filled = np.stack([_fill_unknown(times[..., k]) for k in range(len(STEPS))], axis=-1)
     filled = np.concatenate([filled, filled[..., :1]], axis=-1)
     before = before.astype(np.int64)
     before[-1] = nodes  # the root is at the goal: not negative, which would mean no way
@@ -228,7 +228,7 @@ def lattice_around(
 Edges = tuple[Ints, Ints, F64]  # start and end nodes in the robot's direction, and the seconds
 
 
-def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
+def _outer_edges(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
     """Return the edges between the floor's cells, except those within the window."""
     within = np.zeros(graph.shape[0], np.bool_)
     within[window.cells[~window.border]] = True
@@ -237,7 +237,7 @@ def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
     return way.col[kept], way.row[kept], way.data[kept] / motion.ahead_mps
 
 
-def _across(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
+def _border_edges(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
     """Return the edges between states and cells along the window's border."""
     enter_s = ENTER_RAD / motion.turn_radps
     at = np.flatnonzero(window.border[..., None] & free)
@@ -246,7 +246,7 @@ def _across(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
     return np.append(at + cells, cell), np.append(cell, at + cells), np.append(leave, enter)
 
 
-def _arrivals(
+def _goal_edges(
     free: Bools, window: Window, goal: tuple[float, float], goal_radius_m: float
 ) -> Edges:
     """Return the edges from states and cells at the goal to the root, which is the last node."""
@@ -259,7 +259,7 @@ def _arrivals(
     return at, np.full(len(at), nx * ny + free.size), np.full(len(at), 1e-9)
 
 
-def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
+def _inner_edges(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
     """Return the edges between the window's states; their nodes are numbered after the cells."""
     nx, ny, headings = free.shape
     index = np.arange(free.size).reshape(free.shape)
@@ -275,22 +275,22 @@ def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
 
     for k, (dx, dy) in enumerate(STEPS):
         length = CELL_M * float(np.hypot(dx, dy))
-        one = index[max(-dx, 0) : nx - max(dx, 0), max(-dy, 0) : ny - max(dy, 0)]
-        other = index[max(dx, 0) : nx - max(-dx, 0), max(dy, 0) : ny - max(-dy, 0)]
+        start = index[max(-dx, 0) : nx - max(dx, 0), max(-dy, 0) : ny - max(dy, 0)]
+        end = index[max(dx, 0) : nx - max(-dx, 0), max(dy, 0) : ny - max(-dy, 0)]
         ahead = length / motion.ahead_mps
         back = length / motion.back_mps if motion.back_mps else 0.0
-        join(one[..., k].ravel(), other[..., k].ravel(), ahead, back=back)
+        join(start[..., k].ravel(), end[..., k].ravel(), ahead, back=back)
         following = (k + 1) % headings
         angle = (HEADINGS_RAD[following] - HEADINGS_RAD[k]) % (2 * np.pi)
         turn = float(angle) / motion.turn_radps
         join(index[..., k].ravel(), index[..., following].ravel(), turn, back=turn)
         for to in (following, (k - 1) % headings):
-            join(one[..., k].ravel(), other[..., to].ravel(), ahead + ARC * turn)
+            join(start[..., k].ravel(), end[..., to].ravel(), ahead + ARC * turn)
     from_, to_, time_s = (np.concatenate(parts) for parts in zip(*edges, strict=True))
     return from_, to_, time_s
 
 
-def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: F64) -> F64:
+def _find_room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: F64) -> F64:
     """Return the clearance (nx, ny, 16) of the outline at every state of the window."""
     pad = float(np.hypot(*outline_m.T).max()) + _FIELD_M
     x, y = (
@@ -313,7 +313,7 @@ def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: 
     return room
 
 
-def _filled(times: F64) -> F64:
+def _fill_unknown(times: F64) -> F64:
     """Fill unknown times (nx, ny) of one heading with the nearest known time plus a penalty."""
     known = np.isfinite(times)
     if not known.any():

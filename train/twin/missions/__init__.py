@@ -18,11 +18,11 @@ def _find() -> dict[str, Mission]:
         for found in pkgutil.iter_modules(__path__)
     ]
     kinds = [NOMINAL, *(module.MISSION for module in modules if hasattr(module, "MISSION"))]
-    return {one.name: one for one in sorted(kinds, key=lambda one: (one.place, one.name))}
+    return {kind.name: kind for kind in sorted(kinds, key=lambda kind: (kind.place, kind.name))}
 
 
 MISSIONS: Mapping[str, Mission] = _find()
 KINDS = tuple(MISSIONS)
 # Default shares by kind: of episodes in training, and of missions at a site that runs well.
-DEFAULT_CONDITIONS: Mapping[str, float] = {name: one.share for name, one in MISSIONS.items()}
-NATURAL: Mapping[str, float] = {name: one.natural for name, one in MISSIONS.items()}
+DEFAULT_CONDITIONS: Mapping[str, float] = {name: kind.share for name, kind in MISSIONS.items()}
+NATURAL: Mapping[str, float] = {name: kind.natural for name, kind in MISSIONS.items()}

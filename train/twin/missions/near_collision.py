@@ -30,21 +30,21 @@ def draw_walks(
 ) -> tuple[Walk | None, ...] | None:
     """Draw one or two people and perhaps a forklift on the robot's route; None if none fits."""
     walks: list[Walk | None] = [None] * AGENTS
-    crossings = _crossings_on(plan, warehouse)
+    crossings = _find_crossings(plan, warehouse)
     for slot in range(1 + int(rng.random() < 0.35)):
         oncoming = rng.random() < 0.4 or not crossings
         walks[slot] = (
-            _oncoming(rng, plan)
+            _draw_oncoming(rng, plan)
             if oncoming
-            else _crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
+            else _draw_crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
         )
     if crossings and rng.random() < 0.65:  # only about half of these find room
         place = crossings[rng.integers(len(crossings))]
-        walks[PEOPLE] = _crossing(rng, warehouse, plan, place, 0.6)
+        walks[PEOPLE] = _draw_crossing(rng, warehouse, plan, place, 0.6)
     return tuple(walks) if any(walk is not None for walk in walks) else None
 
 
-def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
+def _find_crossings(plan: F64, warehouse: Warehouse) -> list[int]:
     """Return points of the plan inside a crossing, at least 1.5 m from its ends."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     margin = int(1.5 / max(spacing, 1e-6)) + 1
@@ -53,7 +53,7 @@ def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
     return [margin + int(index) for index in np.flatnonzero(inside)]
 
 
-def _crossing(
+def _draw_crossing(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, index: int, half_width_m: float
 ) -> Walk | None:
     """Draw a walk straight across the plan at point `index`, up to the racks; None without room."""
@@ -79,7 +79,7 @@ def _crossing(
     )
 
 
-def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
+def _draw_oncoming(rng: np.random.Generator, plan: F64) -> Walk:
     """Draw a walk along the plan toward the robot, .25 to .5 m to one side of the plan."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     length = spacing * (len(plan) - 1)

@@ -227,12 +227,12 @@ def names_and_hashes(floors: Iterable[Warehouse]) -> list[list[str]]:
 
 def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehouse]) -> None:
     """Raise RunError if a saved state's `names_and_hashes` are not those of these floors."""
-    here = names_and_hashes(floors)
-    if saved != here:
-        changed = [floor[0] for floor in saved if floor not in here]
+    own = names_and_hashes(floors)
+    if saved != own:
+        changed = [floor[0] for floor in saved if floor not in own]
         raise RunError(
             f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
-            f" {len(saved)} floors, not among this one's {len(here)}",
+            f" {len(saved)} floors, not among this one's {len(own)}",
             where="state of the twin",
             remedy="make the environment with the same layouts as then; a file may have changed",
         )

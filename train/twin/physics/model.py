@@ -242,7 +242,7 @@ def robot_model(robot: Robot | None, body: Body) -> RobotModel:
     Raises:
         ConfigError: the robot's parts do not fit together, or it does not stand, drive or turn.
     """
-    return stand_in(body) if robot is None else _tried(_Key(robot, body))
+    return stand_in(body) if robot is None else _try_out(_Key(robot, body))
 
 
 class _Key:
@@ -260,31 +260,31 @@ class _Key:
 
 
 @functools.lru_cache(maxsize=32)
-def _tried(key: _Key) -> RobotModel:
-    robot = _settled(design(key.robot, key.body))
+def _try_out(key: _Key) -> RobotModel:
+    robot = _settle(design(key.robot, key.body))
     speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
-    ahead, _ = _driven(robot, speed, 0.0)
+    ahead, _ = _drive(robot, speed, 0.0)
     # Scale the contact spheres, which sink in, so that the robot rolls on its wheels' radius.
-    radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
-    robot = _settled(replace(robot, contact_radius_m=radius))
+    radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_radius_m(robot, ahead, speed)
+    robot = _settle(replace(robot, contact_radius_m=radius))
     if robot.drive == "skid_steer" and key.robot.track_ratio is None:
         turn = min(TRY_TURN, robot.speed_limit[1] / 2)
         for _ in range(3):
-            _, turned = _driven(robot, 0.0, turn)
+            _, turned = _drive(robot, 0.0, turn)
             if not turned > 0.02 * turn:
-                raise _unfit("its wheels do not turn it on the spot")
+                raise _unfit_error("its wheels do not turn it on the spot")
             robot = replace(robot, turn_track_m=robot.turn_track_m * turn / turned)
     return robot
 
 
-def _rolling_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
+def _rolling_radius_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
     """Return the wheels' rolling radius, from the driven and the commanded speed."""
     if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
-        raise _unfit(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
+        raise _unfit_error(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
     return robot.wheel_radius_m * ahead_mps / speed_mps
 
 
-def _settled(robot: RobotModel) -> RobotModel:
+def _settle(robot: RobotModel) -> RobotModel:
     """Return the robot with its measured height at rest, `rest_z_m`."""
     model = build_robot_alone(replace(robot, rest_z_m=robot.contact_radius_m), TIMESTEP_S)
     data = mujoco.MjData(model)
@@ -292,7 +292,7 @@ def _settled(robot: RobotModel) -> RobotModel:
     _, x, y, _ = data.qpos[3:7]
     tilt = float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
     if not np.isfinite(data.qpos).all() or tilt > MAX_TILT_RAD:
-        raise _unfit(f"standing still it tips over, by {np.degrees(tilt):.0f} degrees")
+        raise _unfit_error(f"standing still it tips over, by {np.degrees(tilt):.0f} degrees")
     return replace(robot, rest_z_m=float(data.qpos[2]))
 
 
@@ -302,7 +302,7 @@ def driven_actions(
     """Return the steady speeds (m/s, rad/s) of each action on a floor of this friction."""
     rows = []
     for speed, turn in actions:
-        ahead, turned = _driven(robot, speed, turn, friction)
+        ahead, turned = _drive(robot, speed, turn, friction)
         rows.append(
             {
                 "speed_mps": speed,
@@ -330,8 +330,8 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
         "lidar.beams": len(model.bearings_rad),
         "lidar.angle_min_rad": lidar.angle_min_rad,
         "lidar.angle_max_rad": lidar.angle_max_rad,
-        "max_speed_mps": _known(model.speed_limit[0]),
-        "max_yaw_rate_radps": _known(model.speed_limit[1]),
+        "max_speed_mps": _finite_or_none(model.speed_limit[0]),
+        "max_yaw_rate_radps": _finite_or_none(model.speed_limit[1]),
         "max_accel_mps2": model.accel_limit[0],
         "max_yaw_accel_radps2": None if model.steers else model.accel_limit[1],
         "max_steering_rate_radps": model.steering_rate_radps if model.steers else None,
@@ -375,11 +375,11 @@ def outside(model: RobotModel, body: Body) -> list[str]:
     return found
 
 
-def _known(limit: float) -> float | None:
+def _finite_or_none(limit: float) -> float | None:
     return limit if np.isfinite(limit) else None
 
 
-def _driven(
+def _drive(
     robot: RobotModel, speed_mps: float, yaw_rate_radps: float, friction: float = FLOOR_FRICTION
 ) -> tuple[float, float]:
     """Return the steady speed (m/s) and yaw rate (rad/s) under a command."""
@@ -391,15 +391,15 @@ def _driven(
     steps = round(1.0 / TIMESTEP_S)
     for step in range(steps):  # ramp up over 1 s, since no robot starts at its full speed
         share = np.array((step + 1) / steps)
-        _control(robot, model, data, speed_mps * share, yaw_rate_radps * share)
+        _set_controls(robot, model, data, speed_mps * share, yaw_rate_radps * share)
         mujoco.mj_step(model, data)
     _run(model, data, 0.5)
-    rows = np.array([_motion(model, data) for _ in range(round(DRIVE_S / TIMESTEP_S))])
+    rows = np.array([_step(model, data) for _ in range(round(DRIVE_S / TIMESTEP_S))])
     ahead, turned = rows.mean(axis=0)
     return float(ahead), float(turned)
 
 
-def _control(
+def _set_controls(
     robot: RobotModel, model: mujoco.MjModel, data: mujoco.MjData, speed: F64, turn: F64
 ) -> None:
     motion = np.array([[[speed, turn]]])  # (1, 1, 2)
@@ -412,7 +412,7 @@ def _control(
     data.ctrl[:] = values
 
 
-def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:
+def _step(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:
     """Step the physics once; return forward speed (m/s) and yaw rate (rad/s)."""
     mujoco.mj_step(model, data)
     w, x, y, z = data.qpos[3:7]
@@ -425,7 +425,7 @@ def _run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
         mujoco.mj_step(model, data)
 
 
-def _unfit(problem: str) -> ConfigError:
+def _unfit_error(problem: str) -> ConfigError:
     return ConfigError(
         f"`robot`: {problem}",
         where="the twin",

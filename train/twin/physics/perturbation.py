@@ -105,11 +105,11 @@ def load_perturbation(path: Path | str) -> Perturbation:
     """
     values = read_toml(Path(path))
     if "ranges" in values:
-        raise is_schedule(str(path))
+        raise schedule_error(str(path))
     return typed(values, Perturbation, where=str(path), remedy=_FIELDS)
 
 
-def is_schedule(where: str) -> ConfigError:
+def schedule_error(where: str) -> ConfigError:
     """Return the error for a schedule given where one set of parameters is needed."""
     return ConfigError(
         "is a schedule, whose parameters differ from episode to episode: here they must be fixed",

@@ -119,7 +119,7 @@ class Traffic(Stateful):
         gap, attentive = self._gap(delta, pose[:, 2:]), self.attentive[ids]
         heading = self.heading_rad[ids]
         toward = -(np.cos(heading) * delta[..., 0] + np.sin(heading) * delta[..., 1]) > 0
-        careless = np.where(_driven_at(delta, velocity[ids, None]), 0.0, STANDING_M)
+        careless = np.where(_drives_at(delta, velocity[ids, None]), 0.0, STANDING_M)
         look_out = np.where(attentive, YIELD_M, careless)
         walking = state == WALKING
         halted = walking & toward & (gap < look_out)
@@ -181,40 +181,41 @@ class Traffic(Stateful):
             yaw: headings of the robots, (n, 1).
         """
         gap = np.empty(delta.shape[:2])
-        outside = _outside_m(_turned(delta[:, :PEOPLE], -yaw), self.body_half_m)
+        outside = _distance_m(_rotate(delta[:, :PEOPLE], -yaw), self.body_half_m)
         gap[:, :PEOPLE] = outside - PERSON_RADIUS_M
         # Two separate rectangles are nearest to each other at a corner of one of them.
         turn, truck = (self.heading_rad[ids, PEOPLE:] - yaw)[..., None], np.array(_TRUCK_HALF_M)
-        away = _turned(delta[:, PEOPLE:], -yaw)[:, :, None]
-        corners = away + _turned(_CORNERS * truck, turn)
-        back = _turned(_CORNERS * self.body_half_m - away, -turn)
+        away = _rotate(delta[:, PEOPLE:], -yaw)[:, :, None]
+        corners = away + _rotate(_CORNERS * truck, turn)
+        back = _rotate(_CORNERS * self.body_half_m - away, -turn)
         gap[:, PEOPLE:] = np.minimum(
-            _outside_m(corners, self.body_half_m).min(axis=-1), _outside_m(back, truck).min(axis=-1)
+            _distance_m(corners, self.body_half_m).min(axis=-1),
+            _distance_m(back, truck).min(axis=-1),
         )
         gap[self.state[ids] == HIDDEN] = np.inf
         return np.asarray(np.maximum(gap.min(axis=1), 0.0), np.float64)
 
     def _gap(self, delta: F64, yaw: F64) -> F64:
         """Return gaps (n, AGENTS) from agents' circles to outlines; arguments of `_outline_gap`."""
-        gap: F64 = _outside_m(_turned(delta, -yaw), self.body_half_m) - self.radius_m
+        gap: F64 = _distance_m(_rotate(delta, -yaw), self.body_half_m) - self.radius_m
         return gap
 
 
-def _driven_at(delta: F64, velocity: F64) -> Bools:
+def _drives_at(delta: F64, velocity: F64) -> Bools:
     """Return which agents (n, AGENTS) a robot approaches with its velocity (n, 1, 2)."""
     x, y = delta[..., 0], delta[..., 1]
     closing = (x * velocity[..., 0] + y * velocity[..., 1]) / np.maximum(np.hypot(x, y), 1e-9)
     return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
 
-def _turned(vectors: F64, angle_rad: F64) -> F64:
+def _rotate(vectors: F64, angle_rad: F64) -> F64:
     """Rotate vectors (..., 2) to the left by angles that broadcast against (...)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[..., 0], vectors[..., 1]
     return stacked(cos * x - sin * y, sin * x + cos * y)
 
 
-def _outside_m(points: F64, half_m: F64) -> F64:
+def _distance_m(points: F64, half_m: F64) -> F64:
     """Return the distance from a rectangle around the origin to points (..., 2); 0 inside."""
     outside = np.maximum(np.abs(points) - half_m, 0.0)
     return np.asarray(np.hypot(outside[..., 0], outside[..., 1]), np.float64)
@@ -329,13 +330,13 @@ class Lidar:
         self._bearing = np.ascontiguousarray(bearings_rad[self._order])
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
-        standing = [self._in_plane(*boxes) for boxes in scenery.buildings]
+        standing = [self._cut_boxes(*boxes) for boxes in scenery.buildings]
         self._first = np.cumsum([0, *(len(boxes) for boxes in standing)])
         self._standing = np.concatenate(standing)
         self._half_m = MOVING_HALF_M[:, :2].copy()  # of pallets, people and forklifts
         self._half_m[scenery.handles.people, 1] = 0.0  # marks a cylinder
 
-    def _in_plane(self, middle: F64, half: F64) -> F64:
+    def _cut_boxes(self, middle: F64, half: F64) -> F64:
         """Return the boxes (G, 4) that the beams' plane cuts: x, y and half sizes."""
         cut = np.abs(middle[:, 2] - self.height_m) <= half[:, 2]
         return np.column_stack([middle[cut, :2], half[cut, :2]])
@@ -358,12 +359,12 @@ class Lidar:
             self.scenery.floor[ids],
             self._first,
             self._standing.reshape(-1),
-            self._moved(ids).reshape(-1),
+            self._moving_shapes(ids).reshape(-1),
             ranges.reshape(-1),
         )
         return ranges
 
-    def _moved(self, ids: Ints) -> F64:
+    def _moving_shapes(self, ids: Ints) -> F64:
         """Return x, y, cos, sin and half sizes (n, M, 6) of mocap bodies for `compiled.ranges`."""
         position, quat = self.scenery.position_m[ids], self.scenery.quat[ids]
         shapes = np.empty((*position.shape[:2], 6))

@@ -60,7 +60,7 @@ class Sensing(Stateful):
         self.beams = SectorMap.build(simulation.bearings_rad, max(task.sectors, 4), task.body)
         self._fine = FineLidar(simulation.bearings_rad + task.body.lidar_yaw_rad)
         self.tracker = Tracker(task, simulation.num_envs) if task.tracks else None
-        self._around = None if _sees_everything(simulation) else _Around(simulation)
+        self._true_room = None if _sees_everything(simulation) else _TrueRoom(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
         self._drawn = np.full(num, steps)  # steps whose noise is drawn; all of them until a reset
@@ -134,10 +134,10 @@ class Sensing(Stateful):
         noise = self._noise[ids, step]
         scalar = noise[:, :_SCALARS] * self._scale[ids]
         true_ranges = sim.cast(ids)
-        if self._around is None:
+        if self._true_room is None:
             room = true_ranges - self.beams.reach_m
         else:
-            room = self._around.room_m(ids)
+            room = self._true_room.room_m(ids)
         self.true_clearance_m[ids] = np.maximum(np.minimum.reduce(room, axis=1), 0.0)
         beam = noise[:, _SCALARS:].astype(np.float64)
         ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
@@ -210,7 +210,7 @@ class Sensing(Stateful):
             signals |= self.tracker.update(signals, scan_m, stamp_ns)
 
 
-class _Around:
+class _TrueRoom:
     """The true room around robots whose lidar does not see all around, or sees over obstacles."""
 
     def __init__(self, simulation: Simulation) -> None:

@@ -62,7 +62,7 @@ class BaseController(Stateful):
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
         self.left_gain = np.ones(num_envs)
-        # A cache: since_s -> result of `_change`.
+        # A cache: since_s -> result of `_find_change`.
         self._changes: dict[float, tuple[Ints, Ints, tuple[Bools, F64, F64]]] = {}
 
     def reset(self, env: int) -> None:
@@ -89,26 +89,26 @@ class BaseController(Stateful):
         They are wheel speeds in rad/s, (N, substeps, actuators), in the model's order. The
         controller ramps toward the command in force.
         """
-        old, new, reach = self._in_force(since_s)
+        old, new, reach = self._find_commands(since_s)
         ramp = _ramp(self.set_point[:, None], old, new, reach)
         self.set_point = ramp[:, -1].copy()
         speeds = self._wheels(ramp)
         return speeds if self._axles == 1 else np.tile(speeds, self._axles)
 
-    def _in_force(self, since_s: float) -> tuple[F64, F64, tuple[Bools, F64, F64]]:
+    def _find_commands(self, since_s: float) -> tuple[F64, F64, tuple[Bools, F64, F64]]:
         """Return the commands (N, 1, 2) in force at the first and last substep of a block.
 
         Also returns the substeps (N, S, 1) in which the first command is in force, and how far
         (N, S, 2) a ramp gets by each substep toward the first command and toward the last.
         """
         if since_s not in self._changes:
-            self._changes[since_s] = self._change(since_s)
+            self._changes[since_s] = self._find_change(since_s)
         first, last, reach = self._changes[since_s]
         rows = np.arange(len(first))
         return self.commands[rows, first][:, None], self.commands[rows, last][:, None], reach
 
-    def _change(self, since_s: float) -> tuple[Ints, Ints, tuple[Bools, F64, F64]]:
-        """Return the ages (N,), in periods, of both commands, and the other results of `_in_force`.
+    def _find_change(self, since_s: float) -> tuple[Ints, Ints, tuple[Bools, F64, F64]]:
+        """Return the ages (N,) of both commands, in periods, and the rest of `_find_commands`.
 
         The command changes at most once within a block.
         """
@@ -158,18 +158,18 @@ class SteeringController(BaseController):
 
     def controls(self, since_s: float) -> F64:
         """Return speeds of the rear wheels and angles (rad) of the front ones over a block."""
-        old, new, reach = self._in_force(since_s)
+        old, new, reach = self._find_commands(since_s)
         begin = stacked(self.set_point[:, 0], self.steering_rad)[:, None]
-        first = self._steered(old, begin[..., 1])
+        first = self._to_steering(old, begin[..., 1])
         turned = begin[..., 1] + _limit(first[..., 1] - begin[..., 1], reach[1][:, -1:, 1])
-        ramp = _ramp(begin, first, self._steered(new, turned), reach)
+        ramp = _ramp(begin, first, self._to_steering(new, turned), reach)
         speed, steering = ramp[..., 0], ramp[..., 1]
         self.steering_rad = steering[:, -1].copy()
         driven = np.stack([speed, self.robot.yaw_rate(speed, steering)], axis=-1)
         self.set_point = driven[:, -1].copy()
         return np.concatenate([self._wheels(driven), self.robot.front_angles(steering)], axis=-1)
 
-    def _steered(self, command: F64, held_rad: F64) -> F64:
+    def _to_steering(self, command: F64, held_rad: F64) -> F64:
         """Convert commands (N, 1, 2) to speeds and steering angles."""
         steering = self.robot.steering_for(command, held_rad)
         return stacked(command[..., 0], steering)
@@ -481,9 +481,9 @@ class Simulation(Stateful):
 
     def wheel_speeds(self, ids: Ints | slice = slice(None)) -> F64:
         """Return the speeds (N, 2) of the left and right wheels, in rad/s."""
-        return self.robot.by_side(self._turning(ids))
+        return self.robot.by_side(self._wheel_spin(ids))
 
-    def _turning(self, ids: Ints | slice = slice(None)) -> F64:
+    def _wheel_spin(self, ids: Ints | slice = slice(None)) -> F64:
         """Return the speeds (n, W) of all wheels, in rad/s."""
         spin: F64 = self.qvel[ids].take(self._wheel_qvel, axis=1)
         return spin
@@ -508,7 +508,7 @@ class Simulation(Stateful):
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
         ground = forward[:, None] - velocity[:, 5, None] * self._wheels_m[:, 1]
         aside = lateral[:, None] + velocity[:, 5, None] * self._wheels_m[:, 0]
-        rim = self._turning(ids) * self.body.radius_m[ids, None]
+        rim = self._wheel_spin(ids) * self.body.radius_m[ids, None]
         if self.robot.steers:
             steering = self.qpos[ids].take(self._steering_qpos, axis=1)
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)

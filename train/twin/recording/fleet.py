@@ -49,7 +49,7 @@ SCRIPTED = (HANDOVER, "planner", "operator", "random")
 # Shares of drivers in the fleet: the planner, its next release on a few robots (an operator takes
 # over from both), and an operator who drives whole missions.
 FLEET = {"planner 1": 0.70, "planner 2": 0.18, f"operator {Operator.version}": 0.12}
-VERSIONS = {one.name: one.version for one in (PlannerFollower, Operator, RandomPolicy)}
+VERSIONS = {driver.name: driver.version for driver in (PlannerFollower, Operator, RandomPolicy)}
 BLOCK = 20  # missions drawn at a time, so that a short recording has every condition, too
 
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
@@ -87,7 +87,7 @@ def schedule(
         name, version = next(drivers).split() if driver == HANDOVER else (driver, version)
         kind, mission_seed = next(kinds), int(rng.integers(1 << 31))
         yield Mission(
-            EpisodeSpec(kind, mission_seed, _in_force(hardware, mission_seed)),
+            EpisodeSpec(kind, mission_seed, _choose_hardware(hardware, mission_seed)),
             name,
             version,
             handover=driver == HANDOVER and name == "planner",
@@ -149,7 +149,7 @@ class OrderedMissions:
             name, version = next(self._drivers).split()
         spec = self.orders.spec(number, int(rng.integers(1 << 31)))
         return Mission(
-            msgspec.structs.replace(spec, perturbation=_in_force(self._hardware, spec.seed)),
+            msgspec.structs.replace(spec, perturbation=_choose_hardware(self._hardware, spec.seed)),
             name,
             version,
             handover=self._driver == HANDOVER and name == "planner",
@@ -165,7 +165,7 @@ def meets(kind: str, true_conditions: Sequence[str]) -> bool:
     )
 
 
-def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
+def _choose_hardware(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
     if isinstance(hardware, Perturbation):
         return hardware
     return hardware.draw(np.random.default_rng([mission_seed, 1]))

@@ -189,9 +189,9 @@ class Robot:
         ahead = _at_ticks(accel[:, 0], tick, drive.signals["accel_x_mps2"])
         data = topics.imu(
             self._stamps(times),
-            _rounded(gyro, GYRO_LSB_RADPS),
-            _rounded(ahead, ACCEL_LSB_MPS2),
-            _rounded(accel[:, 1], ACCEL_LSB_MPS2),
+            _round(gyro, GYRO_LSB_RADPS),
+            _round(ahead, ACCEL_LSB_MPS2),
+            _round(accel[:, 1], ACCEL_LSB_MPS2),
         )
         return self._send("/imu", times, data)
 
@@ -204,7 +204,7 @@ class Robot:
 
     def _scans(self, drive: Drive) -> list[Message]:
         scan_time_s = max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s)
-        ranges_m = _rounded(drive.ranges_m, LIDAR_LSB_M)
+        ranges_m = _round(drive.ranges_m, LIDAR_LSB_M)
         data = topics.scans(self._stamps(drive.scan_s), ranges_m, self.lidar, scan_time_s)
         return self._send("/scan", drive.scan_s, data)
 
@@ -232,7 +232,7 @@ class Robot:
         tf_s, _ = self._sample(drive, self.rates.tf)
         newest = np.clip(np.searchsorted(times, tf_s, "right") - 1, 0, None)
         base_then = drive.motion.at(reckoned, measured_s)
-        correction = _between(base_then, np.stack([x, y, yaw], axis=-1))[newest]
+        correction = _frame_between(base_then, np.stack([x, y, yaw], axis=-1))[newest]
         odom_to_base = drive.motion.at(reckoned, tf_s)
         data = topics.transforms(self._stamps(tf_s), _pose(correction), _pose(odom_to_base))
         return poses + self._send("/tf", tf_s, data)
@@ -343,7 +343,7 @@ def _at_ticks(between: F64, tick: NDArray[np.intp], seen: NDArray[Any]) -> F64:
     return np.where(on_tick, seen[tick], between)
 
 
-def _rounded(values: F64, lsb: float) -> F64:
+def _round(values: F64, lsb: float) -> F64:
     return np.rint(values / lsb) * lsb
 
 
@@ -357,7 +357,7 @@ def _pose(rows: F64) -> tuple[F64, F64, F64]:
     return _f32(x), _f32(y), _f32(wrap_angle(yaw))
 
 
-def _between(inner: F64, outer: F64) -> F64:
+def _frame_between(inner: F64, outer: F64) -> F64:
     """Return the frame (n, 3) in which poses `inner` (n, 3) are poses `outer` (n, 3)."""
     yaw = outer[:, 2] - inner[:, 2]
     cos, sin = np.cos(yaw), np.sin(yaw)

@@ -505,11 +505,11 @@ def on_floor(places: F64) -> Bools:
 
 @functools.lru_cache(maxsize=64)
 def _traffic_layout(seen: tuple[bool, ...]) -> MessageLayout:
-    tall = 2 * PERSON_RADIUS_M
+    wide = 2 * PERSON_RADIUS_M
     markers = [_delete_all(0)]
     for agent in np.flatnonzero(seen).tolist():
         kind, shape, size, color = (
-            ("person", _CYLINDER, (tall, tall, PERSON_HEIGHT_M), PERSON)
+            ("person", _CYLINDER, (wide, wide, PERSON_HEIGHT_M), PERSON)
             if agent < PEOPLE
             else ("forklift", _CUBE, tuple(2 * half for half in FORKLIFT_HALF_M), FORKLIFT)
         )
