@@ -41,9 +41,9 @@ A = TypeVar("A")
 T = TypeVar("T")
 D = TypeVar("D")
 # Limits of the short recordings that are labelled together: their number and total size.
-BUNDLE, BUNDLE_BYTES = 16, 64 << 20
-PATIENCE_S = 10  # a worker that was asked to stop is killed after this time
-AGAIN = "run it again: recordings that are already in the store are skipped"
+MAX_BUNDLE, MAX_BUNDLE_BYTES = 16, 64 << 20
+STOP_TIMEOUT_S = 10  # a worker that was asked to stop is killed after this time
+RERUN = "run it again: recordings that are already in the store are skipped"
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,9 @@ def ingest_all(
     group = CommitGroup(here.writer)
     some = min(workers, len(taken))
     if some > 1:
-        read = _by_workers(job, taken, some, group)
+        read = _prepare_in_workers(job, taken, some, group)
     else:
-        read = _one_by_one(here, taken, group, watch)
+        read = _prepare_serially(here, taken, group, watch)
     next_up = 0
     try:
         with closing(read):
@@ -181,7 +181,7 @@ def ingest_all(
         group.discard()
 
 
-def _one_by_one(
+def _prepare_serially(
     job: IngestJob, paths: Sequence[Path], group: CommitGroup, watch: Watch | None
 ) -> Generator[tuple[int, Prepared | RestockError]]:
     """Prepare the recordings in this process, and commit waiting ones while a long one is read."""
@@ -191,13 +191,13 @@ def _one_by_one(
         if watch is not None:
             watch(what, done, of)
 
-    for bundle in _bundles(paths, BUNDLE):
+    for bundle in _bundles(paths, MAX_BUNDLE):
         several = [paths[place] for place in bundle]
         for at, one in job.prepare_several(several, watch=watched, settle=group.settle):
             yield bundle[at], one
 
 
-def _by_workers(
+def _prepare_in_workers(
     job: IngestJob, paths: Sequence[Path], workers: int, group: CommitGroup
 ) -> Generator[tuple[int, Prepared | RestockError] | None]:
     """Prepare the recordings in several processes.
@@ -206,14 +206,14 @@ def _by_workers(
     """
 
     def died(bundle: Sequence[Path], code: int) -> list[Prepared | RestockError]:
-        return [_died(path, code) for path in bundle if len(bundle) == 1]
+        return [_died_error(path, code) for path in bundle if len(bundle) == 1]
 
-    left = _bundles(paths, min(BUNDLE, max(len(paths) // (4 * workers), 1)))
+    left = _bundles(paths, min(MAX_BUNDLE, max(len(paths) // (4 * workers), 1)))
     while left:
         bundles, left = left, []
         several = [[paths[place] for place in bundle] for bundle in bundles]
-        for arrived in side_by_side(
-            job.prepare_list, several, workers, died=died, patience_s=group.due_in_s
+        for arrived in run_in_workers(
+            job.prepare_list, several, workers, died=died, wait_s=group.due_in_s
         ):
             if arrived is None:
                 yield None
@@ -224,12 +224,12 @@ def _by_workers(
 
 
 def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
-    """Group the indices of consecutive recordings: up to `most`, and up to BUNDLE_BYTES in all."""
+    """Group the indices of consecutive recordings, up to `most` and MAX_BUNDLE_BYTES each."""
     bundles: list[list[int]] = []
     whole = 0
     for place, path in enumerate(paths):
         size = _size(path)
-        if not bundles or len(bundles[-1]) >= most or whole + size > BUNDLE_BYTES:
+        if not bundles or len(bundles[-1]) >= most or whole + size > MAX_BUNDLE_BYTES:
             bundles.append([])
             whole = 0
         bundles[-1].append(place)
@@ -240,16 +240,16 @@ def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
 def out_of_memory(path: Path) -> RecordingError:
     """Return the error of a recording that ran out of memory."""
     return RecordingError(
-        "out of memory", where=str(path), remedy=f"use fewer --workers or more memory, then {AGAIN}"
+        "out of memory", where=str(path), remedy=f"use fewer --workers or more memory, then {RERUN}"
     )
 
 
-def _died(path: Path, code: int) -> RecordingError:
+def _died_error(path: Path, code: int) -> RecordingError:
     how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     return RecordingError(
         f"the process that read it {how}",
         where=str(path),
-        remedy=f"if out of memory, use fewer --workers; then {AGAIN}",
+        remedy=f"if out of memory, use fewer --workers; then {RERUN}",
     )
 
 
@@ -257,21 +257,21 @@ def _died(path: Path, code: int) -> RecordingError:
 class _Worker(Generic[T]):
     process: BaseProcess
     pipe: Connection
-    at_hand: int | None = None  # index of the recording it works on
+    index: int | None = None  # index of the recording it works on
 
 
-def side_by_side(
+def run_in_workers(
     work: Callable[[A], T],
     paths: Sequence[A],
     workers: int,
     *,
     died: Callable[[A, int], D],
-    patience_s: Callable[[], float | None] = lambda: None,
+    wait_s: Callable[[], float | None] = lambda: None,
 ) -> Generator[tuple[int, T | D] | None]:
     """Call `work` on each element in worker processes; yield its index and result when it is done.
 
     An element is a path or a sequence of paths. If its process died, the result is `died(element,
-    exit code)`. Yields None if no result came for `patience_s()` seconds, evaluated at each wait.
+    exit code)`. Yields None if no result came for `wait_s()` seconds, evaluated at each wait.
     The largest recordings begin first, so that none of them runs alone at the end. If the caller or
     Ctrl-C stops early, all workers end.
     """
@@ -281,12 +281,12 @@ def side_by_side(
 
     def begin(worker: _Worker[T]) -> None:
         """Give the worker the next recording, or end it if none is left."""
-        worker.at_hand = ahead.popleft() if ahead else None
-        if worker.at_hand is None:
+        worker.index = ahead.popleft() if ahead else None
+        if worker.index is None:
             worker.pipe.close()
             pool.remove(worker)
         else:
-            worker.pipe.send(paths[worker.at_hand])
+            worker.pipe.send(paths[worker.index])
 
     def hire() -> None:
         ours, theirs = context.Pipe()
@@ -300,11 +300,11 @@ def side_by_side(
         while ahead or pool:
             while ahead and len(pool) < workers:
                 hire()
-            ready = wait([worker.pipe for worker in pool], patience_s())
+            ready = wait([worker.pipe for worker in pool], wait_s())
             if not ready:
                 yield None
             for worker in [worker for worker in pool if worker.pipe in ready]:
-                place = worker.at_hand
+                place = worker.index
                 assert place is not None
                 try:
                     found: T | D = worker.pipe.recv()
@@ -320,7 +320,7 @@ def side_by_side(
         for worker in pool:
             worker.process.terminate()
         for worker in pool:
-            worker.process.join(PATIENCE_S)
+            worker.process.join(STOP_TIMEOUT_S)
             worker.process.kill()
 
 
@@ -333,10 +333,10 @@ def warm_up() -> None:
 def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
     """Run a worker: call `work` on what arrives, until the parent closes the pipe or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
-    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGTERM, _interrupt)
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(parent.sentinel,), daemon=True).start()
     try:
         while True:
             pipe.send(work(pipe.recv()))
@@ -344,12 +344,12 @@ def _serve(pipe: Connection, work: Callable[[A], T]) -> None:
         pipe.close()
 
 
-def _stop(*_: object) -> None:
+def _interrupt(*_: object) -> None:
     """Handle SIGTERM like Ctrl-C: raise KeyboardInterrupt, so that the work cleans up."""
     raise KeyboardInterrupt
 
 
-def _end_with(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     """End this process when its parent ends, as nobody reads its results any more."""
     wait([parent])
     os._exit(1)

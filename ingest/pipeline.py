@@ -34,7 +34,7 @@ from restock.errors import (
     visible,
 )
 from restock.ingest.containers.mcap_file import metadata_of
-from restock.ingest.containers.open_recording import identify, open_recording, state_of
+from restock.ingest.containers.open_recording import file_state, identify, open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
 from restock.ingest.profile.profile import Profile, parse_profile, profile_toml
@@ -170,14 +170,14 @@ def preparing(
         before = store.manifest(file.recording_id)
         if before is not None and _unchanged(before, profile):
             said, stored = metadata_of(file.path), before.get("tags") or {}
-            if said is not None and not _other_robot(before, profile):
+            if said is not None and not _has_other_robot(before, profile):
                 reported = resolve_tags(profile.tags, file.path, said, tags, stored)
                 if reported.tags == stored:
                     return Prepared(IngestResult(str(path), "unchanged", before))
     with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
         renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)
-        if file is not None and file.state == state_of(file.path):
+        if file is not None and file.state == file_state(file.path):
             recording.recording_id = file.recording_id
         else:
             settle(recording.recording_id)
@@ -186,7 +186,7 @@ def preparing(
         reported = resolve_tags(profile.tags, Path(path), recording.metadata, tags, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
             new: dict[str, Any] = {"tags": reported.tags}
-            if _other_robot(before, profile):
+            if _has_other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
                 new["uncertain_conditions"] = uncertain_conditions(profile)
             elif reported.tags == (before["tags"] or {}):
@@ -210,7 +210,7 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
     return all(by_rules[name] == value for name, value in definitions(profile).items())
 
 
-def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
+def _has_other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
     """Return whether a recording was ingested with another [robot] in its profile."""
     stored = _stored_profile(before["profile_toml"])
     return stored is not None and stored.robot != profile.robot
@@ -302,13 +302,13 @@ class _Ingest:
             self.path,
             "written" if store else "dry run",
             manifest,
-            self._messages(),
+            self._count_messages(),
             counts,
             first,
             {name: int(holds[rows.starts].sum()) for name, holds in rows.exposures.items()},
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
-            self._lost_messages(steps),
+            self._describe_losses(steps),
             [one.reported for one in steps.findings if not one.repaired],
             self._notes(steps, table),
         )
@@ -324,11 +324,11 @@ class _Ingest:
     ) -> Staged:
         # With corrections, refuse to overwrite those that another process makes in the meantime.
         read = self.before["ingest_id"] if self.corrections else None
-        with self._frames_written(store, manifest, kept):
+        with self._writing_frames(store, manifest, kept):
             return store.stage(row, table, instead_of=read)
 
     @contextmanager
-    def _frames_written(
+    def _writing_frames(
         self, store: StoreWriter, manifest: Mapping[str, Any], kept: Sequence[KeptFrames]
     ) -> Iterator[None]:
         """Write the camera frames to their file, and delete the file again if the block fails.
@@ -356,7 +356,7 @@ class _Ingest:
             store.discard_frames(file)
             raise
 
-    def _messages(self) -> dict[str, int]:
+    def _count_messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
         expected = sum(account.expected for account in accounts)
         return {
@@ -365,7 +365,7 @@ class _Ingest:
             "unused": self.recording.messages - expected,
         }
 
-    def _lost_messages(self, steps: Steps) -> list[str]:
+    def _describe_losses(self, steps: Steps) -> list[str]:
         frames = [
             f"cameras.{name}: {reason} ({counted(count, 'message')})"
             for name, camera in steps.cameras.items()
@@ -452,7 +452,7 @@ def commit_all(
             group = {}
         if one.staged is None:
             outcomes[place] = one.result
-        elif refused := _refusal(store, one, list(group.values())):
+        elif refused := _repeat_error(store, one, list(group.values())):
             store.discard([one.staged])
             outcomes[place] = refused
         else:
@@ -462,7 +462,7 @@ def commit_all(
     return [outcomes[place] for place in range(len(prepared))]
 
 
-def _refusal(
+def _repeat_error(
     store: StoreWriter, one: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
     """Return an error if the recording repeats a drive of the store or of `before` and must not."""
@@ -517,11 +517,11 @@ def _commit(
     found: dict[int, IngestResult | StoreError | RecordingError] = {}
     for place, one in group.items():
         later = later[1:]
-        found[place] = _finished(store, one, staged[place], version, later)
+        found[place] = _build_result(store, one, staged[place], version, later)
     return found
 
 
-def _finished(
+def _build_result(
     store: StoreWriter, one: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
 ) -> IngestResult | StoreError:
     """Build the result of a committed recording, ignoring the `later` ones of its commit."""
@@ -535,7 +535,7 @@ def _finished(
     notes = list(one.result.notes)
     if repeats is not None and one.repeated == "replace":
         try:
-            replaced_by, note = _replaced(store, repeats)
+            replaced_by, note = _remove_part(store, repeats)
         except StoreError as error:
             replaced_by, note = None, f"a part of it stays in the store: {error}"
         version = replaced_by or version
@@ -550,7 +550,7 @@ def _finished(
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 
 
-def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
+def _remove_part(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
     """Remove a recording that is only a part of what was just ingested.
 
     Returns the version of `transitions` (None if the part stays) and a note for the user.

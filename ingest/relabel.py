@@ -253,7 +253,7 @@ def correct_store(
 
     def corrected() -> Iterator[tuple[pa.Table, pa.Table]]:
         for recording, what in given.items():
-            manifest, rows, outcome = _one(store, live[recording], what.corrections)
+            manifest, rows, outcome = _correct_recording(store, live[recording], what.corrections)
             outcomes.append(outcome)
             if outcome.after != outcome.before:
                 yield manifest, rows
@@ -280,7 +280,7 @@ def remove_corrections(
             manifest, rows, _ = relabel_rows(
                 store, row | {COLUMN: []}, [*conditions, *stored_conditions(row, "exposure")]
             )
-            outcomes.append(_outcome(row, before, rows, corrections_in(row), conditions))
+            outcomes.append(_build_outcome(row, before, rows, corrections_in(row), conditions))
             yield manifest, rows
 
     replaced_ingests = {row["recording_id"]: row["ingest_id"] for row in live}
@@ -303,7 +303,7 @@ def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> li
         ) from error
 
 
-def _one(
+def _correct_recording(
     store: StoreWriter, row: dict[str, Any], given: Sequence[Correction]
 ) -> tuple[pa.Table, pa.Table, Corrected]:
     """Return the corrected manifest and rows of one recording."""
@@ -323,11 +323,11 @@ def _one(
         **score_columns(scores),
         COLUMN: [asdict(one) for one in every],
     }
-    outcome = _outcome(row, before, rows, given, conditions)
+    outcome = _build_outcome(row, before, rows, given, conditions)
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
 
 
-def _outcome(
+def _build_outcome(
     row: Mapping[str, Any],
     before: pa.Table,
     after: pa.Table,

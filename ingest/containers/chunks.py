@@ -17,7 +17,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import most_bytes
+from restock.ingest.containers.storage import max_plausible_bytes
 
 Buffer: TypeAlias = "bytes | FileBytes"
 
@@ -156,7 +156,7 @@ def refuse_implausible(chunk: StoredChunk) -> None:
         BadChunk: its stored bytes cannot hold that much.
     """
     stored = chunk.stop - chunk.start
-    if chunk.size > min(most_bytes(stored), MAX_CHUNK):
+    if chunk.size > min(max_plausible_bytes(stored), MAX_CHUNK):
         raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
 
 
@@ -205,7 +205,7 @@ def _check(chunk: StoredChunk, data: bytes | memoryview) -> None:
 
 def inflate_partly(chunk: StoredChunk, file: Buffer) -> bytes:
     """Return a chunk's first records, unchecked, up to the damage."""
-    limit = min(MAX_CHUNK, chunk.size, most_bytes(chunk.stop - chunk.start))
+    limit = min(MAX_CHUNK, chunk.size, max_plausible_bytes(chunk.stop - chunk.start))
     if chunk.compression == "":
         return file[chunk.start : min(chunk.start + limit, chunk.stop)]
     if chunk.compression not in _DECODERS:

@@ -39,7 +39,7 @@ from restock.ingest.containers.storage import (
     Storage,
     Watch,
     keep_entries,
-    unwatched,
+    no_progress,
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
@@ -75,7 +75,7 @@ class LeRobotFolder(Storage):
             read or is out of order (unless `salvage`).
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = no_progress) -> None:
         super().__init__()
         self._path, self._salvage, self._watch = path, salvage, watch
         info = read_json(path / LEROBOT_INFO, error=RecordingError)
@@ -90,13 +90,13 @@ class LeRobotFolder(Storage):
         robot = info.get("robot_type")
         said = keep_entries({"robot_type": robot} if isinstance(robot, str) else {})[0]
         self.metadata = [Metadata(LEROBOT_INFO, "", said)]
-        self._features = dict(enumerate(self._described(info.get("features")), 2))
+        self._features = dict(enumerate(self._read_features(info.get("features")), 2))
         self.channels = {1: Channel(1, FRAME, "lerobot/msg/Frame", "cdr", "ros2msg", _FRAME)}
         for number, feature in self._features.items():
             text = "".join(f"float64 {name}\n" for name in feature.fields).encode()
             kind, form = (_type(feature), "ros2msg") if text else (IMAGE, "")
             self.channels[number] = Channel(number, f"/{feature.name}", kind, "cdr", form, text)
-        self._files = self._opened()
+        self._files = self._open_files()
         claimed, held = info.get("total_frames"), self.counts[1]
         if isinstance(claimed, int) and claimed != held:
             what = f"{LEROBOT_INFO} counts {claimed:,} frames, and there are {held:,}"
@@ -108,7 +108,7 @@ class LeRobotFolder(Storage):
         there = [file.stamp_ns for file in self._files if len(file.stamp_ns)]
         self.span_ns = (int(there[0][0]), int(there[-1][-1])) if there else None
 
-    def _described(self, features: object) -> Iterator[_Feature]:
+    def _read_features(self, features: object) -> Iterator[_Feature]:
         """Yield the features that are read; list videos in `extras`, and note the others."""
         if not isinstance(features, dict):
             raise RecordingError("it has no features", where=str(self._path / LEROBOT_INFO))
@@ -137,7 +137,7 @@ class LeRobotFolder(Storage):
                 f"{counted(len(self.extras), 'feature')} of video: listed, and not read"
             )
 
-    def _opened(self) -> list[_Frames]:
+    def _open_files(self) -> list[_Frames]:
         """Find the data files and the log times of their frames."""
         columns = ("timestamp", *COUNTERS, *(one.name for one in self._features.values()))
         found: list[tuple[Path, str]] = []
@@ -162,7 +162,7 @@ class LeRobotFolder(Storage):
             parts.append((episode, seconds))
         if not found:
             raise RecordingError("a LeRobot data set without data files", where=str(self._path))
-        stamps, problem = stamps_of(*map(np.concatenate, zip(*parts, strict=True)))
+        stamps, problem = log_times(*map(np.concatenate, zip(*parts, strict=True)))
         if problem is not None:
             ends = np.cumsum([len(episode) for episode, _ in parts])
             at = int(np.searchsorted(ends, problem[0], "right"))
@@ -222,7 +222,7 @@ class LeRobotFolder(Storage):
         feature = self._features[number]
         column = part[feature.name]
         if feature.fields:
-            good, values = rows_of(column, len(feature.fields))
+            good, values = fixed_width_rows(column, len(feature.fields))
             why = f"another number of values than {len(feature.fields)}"
         else:
             pictures = column.field("bytes") if pa.types.is_struct(column.type) else column
@@ -273,7 +273,7 @@ def field_names(names: object, width: int) -> tuple[str, ...]:
     return tuple(fields)
 
 
-def stamps_of(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[int, str] | None]:
+def log_times(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[int, str] | None]:
     """Return a log time for each frame (N,), and the first frame out of order with the reason.
 
     Within an episode, log times follow its timestamps. Each episode begins GAP_S after the end of
@@ -298,7 +298,7 @@ def stamps_of(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[
     return stamps, (at, f"of episode {now:,} is not later than the one before it")
 
 
-def rows_of(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
+def fixed_width_rows(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
     """Return which of N rows have `width` values, and those values, (M, width); null is NaN."""
     good = np.ones(len(column), np.bool_)
     if hasattr(column.type, "value_type"):

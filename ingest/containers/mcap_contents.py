@@ -31,7 +31,7 @@ from restock.ingest.containers.mcap_records import (
     parse,
     walk,
 )
-from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, unwatched
+from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, no_progress
 
 # Limits of what the survey keeps, whatever the file contains.
 MAX_CHUNKS = 1_000_000
@@ -94,7 +94,7 @@ class Contents:
         self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 
-def survey(file: FileBytes, watch: Watch = unwatched, *, only: Collection[int] = ()) -> Contents:
+def survey(file: FileBytes, watch: Watch = no_progress, *, only: Collection[int] = ()) -> Contents:
     """Walk the file's top-level records, and take in all kinds or `only` some.
 
     `watch` is called with the progress.
@@ -143,7 +143,7 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
     elif opcode == Op.CHUNK:
         if len(contents.chunks) >= MAX_CHUNKS:
             raise Malformed(f"more than {MAX_CHUNKS:,} chunks: not read", at)
-        contents.chunks.append(_chunk(file, at, stop))
+        contents.chunks.append(_parse_chunk(file, at, stop))
     elif opcode == Op.MESSAGE_INDEX and contents.chunks:
         index = parse(Op.MESSAGE_INDEX, file, at, stop)
         contents.chunks[-1].index[index["channel_id"]] = index["records"]
@@ -157,11 +157,12 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
     elif opcode == Op.ATTACHMENT:
         attached = parse(Op.ATTACHMENT, file, at, stop)
         low, high = attached["data"]
-        _name(contents, Extra("attachment", attached["name"], attached["media_type"], high - low))
+        media = attached["media_type"]
+        _add_extra(contents, Extra("attachment", attached["name"], media, high - low))
     elif opcode == Op.METADATA:
         named = parse(Op.METADATA, file, at, stop)
-        _name(contents, Extra("metadata", named["name"], "", stop - at))
-        _keep(contents, file.path.name, named["name"], named["metadata"])
+        _add_extra(contents, Extra("metadata", named["name"], "", stop - at))
+        _add_metadata(contents, file.path.name, named["name"], named["metadata"])
     elif opcode == Op.HEADER and not contents.profile:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
 
@@ -190,14 +191,14 @@ def statistics_at(file: FileBytes, at: int, stop: int) -> Statistics:
     return Statistics(record["message_count"], record["channel_message_counts"])
 
 
-def _name(contents: Contents, extra: Extra) -> None:
+def _add_extra(contents: Contents, extra: Extra) -> None:
     if len(contents.extras) < MAX_NAMED:
         contents.extras.append(extra)
     else:
         contents.unnamed += 1
 
 
-def _keep(contents: Contents, file: str, name: str, said: dict[str, str]) -> None:
+def _add_metadata(contents: Contents, file: str, name: str, said: dict[str, str]) -> None:
     """Keep the entries of a metadata record.
 
     rosbag2 writes its metadata.yaml into one when it opens the file and again when it closes it:
@@ -213,7 +214,7 @@ def _keep(contents: Contents, file: str, name: str, said: dict[str, str]) -> Non
         contents.metadata.append(Metadata(source, name, entries))
 
 
-def _chunk(file: FileBytes, at: int, stop: int) -> Chunk:
+def _parse_chunk(file: FileBytes, at: int, stop: int) -> Chunk:
     record = parse(Op.CHUNK, file, at, stop)
     return Chunk(
         at,
@@ -263,10 +264,10 @@ def resume(file: FileBytes, contents: Contents) -> list[str]:
     cut = contents.cut
     if cut is None:
         return []
-    summary = _summary(file)
+    summary = _read_summary(file)
     if summary is not None and summary.statistics is not None and summary.indexed:
-        return _by_index(file, contents, summary, cut.at)
-    return _by_scan(file, contents, cut.at)
+        return _resume_by_index(file, contents, summary, cut.at)
+    return _resume_by_scan(file, contents, cut.at)
 
 
 class _Summary:
@@ -280,7 +281,7 @@ class _Summary:
         self.proven = False  # its CRC matches
 
 
-def _summary(file: FileBytes) -> _Summary | None:
+def _read_summary(file: FileBytes) -> _Summary | None:
     """Read the summary section; None if it is damaged or missing."""
     end = len(file) - len(MAGIC)
     at = end - FOOTER_SIZE
@@ -308,7 +309,7 @@ def _summary(file: FileBytes) -> _Summary | None:
     return summary
 
 
-def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
+def _resume_by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
     """Use the chunks of the chunk index whose records agree with it; return the losses."""
     lost = []
     chunks = []
@@ -332,26 +333,26 @@ def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) 
     contents.loose = {
         channel: whole
         for channel, places in contents.loose.items()
-        if (whole := [at for at in places if at < cut and not _within(at, contents.chunks)])
+        if (whole := [at for at in places if at < cut and not _in_a_chunk(at, contents.chunks)])
     }
     contents.cut_chunk = None
     contents.resumed = True
     return lost
 
 
-def _within(at: int, chunks: list[Chunk]) -> bool:
+def _in_a_chunk(at: int, chunks: list[Chunk]) -> bool:
     return any(chunk.at <= at < chunk.stop for chunk in chunks)
 
 
-def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
+def _resume_by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
     """Continue at each recognisable chunk, and walk to the next damage; return the losses."""
     lost = []
-    for at in _recognised(file, cut + 1):
+    for at in _find_chunks(file, cut + 1):
         if at < cut:
             continue  # already walked
         if contents.cut_chunk is not None:  # it ends at the latest where the next one begins
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
-        lost.append(f"{_lost(contents, cut, at)}: reading continues at the next chunk")
+        lost.append(f"{_describe_loss(contents, cut, at)}: reading continues at the next chunk")
         if contents.cut_chunk is not None:
             contents.chunks.append(contents.cut_chunk)
             contents.cut_chunk = None
@@ -366,10 +367,10 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
         except Malformed as next_cut:
             cut = next_cut.at
             contents.cut_chunk = cut_chunk_at(file, cut, len(file))
-    return [*lost, _lost(contents, cut, len(file))] if cut < len(file) else lost
+    return [*lost, _describe_loss(contents, cut, len(file))] if cut < len(file) else lost
 
 
-def _lost(contents: Contents, cut: int, until: int) -> str:
+def _describe_loss(contents: Contents, cut: int, until: int) -> str:
     """Describe what is lost between the positions `cut` and `until`.
 
     A chunk that begins at `cut` is read as far as possible.
@@ -380,7 +381,7 @@ def _lost(contents: Contents, cut: int, until: int) -> str:
     return f"{at} are part of a chunk: only its complete messages are read"
 
 
-def _recognised(file: FileBytes, start: int) -> Iterator[int]:
+def _find_chunks(file: FileBytes, start: int) -> Iterator[int]:
     """Yield the positions of compressed chunks, recognised by two lengths that agree."""
     nearest = {name: file.find(name, start) for name in _NAMES}
     while places := {at: name for name, at in nearest.items() if at >= 0}:

@@ -32,7 +32,7 @@ from restock.ingest.containers.storage import (
     Storage,
     Watch,
     custom_data,
-    unwatched,
+    no_progress,
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
@@ -56,15 +56,15 @@ class ChunkReader:
         try:
             data = chunks.inflate(chunk, self._file[chunk.start : chunk.stop])
         except BadChunk as bad:
-            self._lost(chunk, bad)
+            self._record_loss(chunk, bad)
             return b""
-        self._read(chunk)
+        self._count_read(chunk)
         return data
 
-    def _lost(self, chunk: Chunk, why: BadChunk) -> None:
+    def _record_loss(self, chunk: Chunk, why: BadChunk) -> None:
         self._owner.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
 
-    def _read(self, chunk: Chunk) -> None:
+    def _count_read(self, chunk: Chunk) -> None:
         """Count a chunk as verified by its CRC, or as unchecked if it has none."""
         self.verified += bool(chunk.crc)
         self.unchecked += not chunk.crc
@@ -81,15 +81,15 @@ class ChunkReader:
         """Yield the messages of channels, group by group; each batch is valid until the next."""
         for group in groups:
             buffer, parts = self._inflate_group(group)
-            whole = self._by_index(parts, buffer, wanted)
+            whole = self._find_by_index(parts, buffer, wanted)
             located = (
                 [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
             )
             for channel in sorted(set().union(*located)):
-                yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
+                yield channel, join_parts(buffer, [at[channel] for at in located if channel in at])
         self._scratch = np.zeros(0, np.uint8)  # free it: the file stays open while rows are made
 
-    def _by_index(
+    def _find_by_index(
         self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages] | None:
         """Find messages of chunks by the chunks' indexes; None if one is missing or wrong."""
@@ -122,7 +122,7 @@ class ChunkReader:
                 chunks.refuse_implausible(chunk)
                 rooms.append((chunk, chunk.size, None))
             except BadChunk as bad:
-                self._lost(chunk, bad)
+                self._record_loss(chunk, bad)
         needed = sum(size for _, size, _ in rooms)
         if len(self._scratch) < needed:
             self._scratch = np.empty(needed, np.uint8)
@@ -136,9 +136,9 @@ class ChunkReader:
                     stored = self._file.large(chunk.start, chunk.stop)
                     chunks.inflate_into(chunk, stored, room)
                 except BadChunk as bad:
-                    self._lost(chunk, bad)
+                    self._record_loss(chunk, bad)
                     continue
-                self._read(chunk)
+                self._count_read(chunk)
             if size:
                 parts.append((chunk, at, size))
                 at += size
@@ -148,7 +148,7 @@ class ChunkReader:
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages]:
         """Find a chunk's messages by its index, or by a walk if the index is missing or wrong."""
-        located = self._by_index([part], buffer, wanted)
+        located = self._find_by_index([part], buffer, wanted)
         if located is not None:
             return located
         chunk, base, size = part
@@ -172,7 +172,7 @@ class ChunkReader:
         return positions
 
 
-def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
+def join_parts(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     """Join messages from several places of one buffer into one batch."""
     return MessageBatch(
         buffer,
@@ -196,7 +196,7 @@ class McapFile(Storage):
         RecordingError: it is not an MCAP file, or is cut short (unless `salvage`).
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = no_progress) -> None:
         super().__init__()
         self.path, self._watch = path, watch
         self._file = FileBytes(path)
@@ -266,7 +266,7 @@ class McapFile(Storage):
         contents, copies = self._contents, self._contents.copies
         needed = {channel for channel, count in self.counts.items() if count}
         proven = copies if contents.summary_proven else Definitions()
-        known = contents.definitions.beneath(proven)
+        known = contents.definitions.overridden_by(proven)
         for at, chunk in enumerate(contents.chunks):
             if not (lacking := known.lacking(needed)):
                 break
@@ -274,13 +274,13 @@ class McapFile(Storage):
             if without_them and not copies.lacking(lacking):
                 continue  # the lacking channels begin in a later chunk
             records = self._chunks.inflate(chunk)
-            known = mcap_records.definitions_in(records).beneath(known)
+            known = mcap_records.definitions_in(records).overridden_by(known)
         if not contents.summary_proven:
             for what in known.differing(copies):
                 self.damaged(
                     f"its summary and its data define {what} differently: the data's is used"
                 )
-            known = copies.beneath(known)
+            known = copies.overridden_by(known)
         for number in needed - known.channels.keys():
             what = f"{self.counts[number]} messages of channel {number}, which the file never names"
             self.damaged(what, {number: self.counts[number]})
@@ -331,7 +331,7 @@ class McapFile(Storage):
         if loose:
             self._check_loose()
         for channel, buffer, messages in self._loose(loose):
-            yield channel, batch_of(buffer, [messages])
+            yield channel, join_parts(buffer, [messages])
         yield from self._chunks.read(self._groups(wanted), wanted)
 
     def _loose(

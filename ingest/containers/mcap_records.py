@@ -305,7 +305,7 @@ def indexed_messages(
     return None if (messages.stop > base + size).any() else messages
 
 
-def _stamps(values: NDArray[np.uint64]) -> Ints:
+def _to_int64_times(values: NDArray[np.uint64]) -> Ints:
     """Convert unsigned 64-bit times to int64; times after 2262 become the largest int64."""
     stamps: Ints = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
     return stamps
@@ -348,8 +348,8 @@ def _messages(at: Ints, head: NDArray[np.void]) -> Messages:
     return Messages(
         at + HEAD_SIZE,
         at + PREFIX + head["length"].astype(np.int64),
-        _stamps(head["log_time"]),
-        _stamps(head["publish_time"]),
+        _to_int64_times(head["log_time"]),
+        _to_int64_times(head["publish_time"]),
     )
 
 
@@ -384,7 +384,8 @@ class Definitions:
         raw = bytes(buffer[at - PREFIX : stop])
         # Cached, as all recordings of a robot have the same definitions.
         try:
-            number, record = (_defined if len(raw) < MAX_KEPT else _defined.__wrapped__)(raw)
+            cached = len(raw) < MAX_KEPT
+            number, record = (_parse_definition if cached else _parse_definition.__wrapped__)(raw)
         except Malformed as bad:
             raise Malformed(bad.what, at - PREFIX + bad.at) from None
         if isinstance(record, SchemaRecord):
@@ -392,7 +393,7 @@ class Definitions:
         else:
             self.channels[number] = record
 
-    def beneath(self, other: Definitions) -> Definitions:
+    def overridden_by(self, other: Definitions) -> Definitions:
         """Return the definitions of both; `other`'s if both define an id."""
         return Definitions(self.schemas | other.schemas, self.channels | other.channels)
 
@@ -431,7 +432,7 @@ class Definitions:
 
 
 @lru_cache(1024)
-def _defined(raw: bytes) -> tuple[int, SchemaRecord | ChannelRecord]:
+def _parse_definition(raw: bytes) -> tuple[int, SchemaRecord | ChannelRecord]:
     """Parse a schema or channel record; return its id and definition."""
     found = parse(Op(raw[0]), raw, PREFIX, len(raw))
     if raw[0] == Op.SCHEMA:

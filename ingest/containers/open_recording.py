@@ -37,7 +37,7 @@ from restock.ingest.containers.storage import (
     Watch,
     custom_data,
     decompress_file,
-    unwatched,
+    no_progress,
     yaml_value,
 )
 from restock.ingest.decoding.decoders import READABLE
@@ -127,7 +127,7 @@ def recordings_in(path: Path | str) -> list[Path]:
     """
     path = recording_path(path)
     try:
-        return _found(path)
+        return _find_recordings(path)
     except OSError as error:  # of this folder; an unreadable subfolder is listed as a recording
         raise cannot_be_read(error, path) from error
 
@@ -141,7 +141,7 @@ def cannot_be_read(error: OSError, path: Path) -> RecordingError:
     )
 
 
-def _found(path: Path) -> list[Path]:
+def _find_recordings(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     _refuse_special(path)
@@ -159,7 +159,7 @@ def _found(path: Path) -> list[Path]:
             )
         return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
-    found = [_within(m) if m.is_dir() else [m] * is_storage_name(m) for m in matches]
+    found = [_search_folder(m) if m.is_dir() else [m] * is_storage_name(m) for m in matches]
     every = list(dict.fromkeys(chain.from_iterable(found)))
     if matches and not every:
         raise RecordingError(
@@ -194,13 +194,13 @@ def _in_folder(folder: Path) -> list[Path]:
         if item.name.startswith(".") or item.name == LOST_AND_FOUND:
             continue
         if item.is_dir():
-            recordings += [] if item.is_symlink() else _within(item)
+            recordings += [] if item.is_symlink() else _search_folder(item)
         elif is_storage_name(item):  # also a broken link or a pipe
             recordings.append(item)
     return recordings
 
 
-def _within(folder: Path) -> list[Path]:
+def _search_folder(folder: Path) -> list[Path]:
     try:
         return _in_folder(folder)
     except OSError:
@@ -259,12 +259,12 @@ def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str
             missing.append(name)
         elif match not in order:
             order.append(match)
-    rest = sorted(storages.keys() - set(order), key=_natural)
+    rest = sorted(storages.keys() - set(order), key=_natural_key)
     files: dict[str, Path] = {}  # by name without the ending of compression
     copies = []
     for name in (*order, *rest):
         file, stem = present[name], _ZSTD.sub("", name)
-        same = files.get(stem) or next((one for one in files.values() if _equal(one, file)), None)
+        same = files.get(stem) or next((f for f in files.values() if _same_content(f, file)), None)
         if same is None:
             files[stem] = file
         else:
@@ -272,12 +272,12 @@ def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str
     return [*files.values()], missing, copies
 
 
-def _equal(one: Path, other: Path) -> bool:
+def _same_content(one: Path, other: Path) -> bool:
     size = one.stat().st_size
     return 0 < size == other.stat().st_size and filecmp.cmp(one, other, shallow=False)
 
 
-def holes(files: Sequence[Path], *, from_zero: bool) -> list[str]:
+def missing_numbers(files: Sequence[Path], *, from_zero: bool) -> list[str]:
     """Return the names of files missing in a bag's numbering (`run_0.db3`, `run_2.db3`).
 
     rosbag2 counts from 0. It may be set to keep only the last files: with `from_zero` False,
@@ -296,7 +296,7 @@ def holes(files: Sequence[Path], *, from_zero: bool) -> list[str]:
     ]
 
 
-def _natural(name: str) -> list[int | str]:
+def _natural_key(name: str) -> list[int | str]:
     parts = re.split(r"(\d+)", name)
     return [int(part) if index % 2 else part for index, part in enumerate(parts)]
 
@@ -322,8 +322,8 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
             problem = f"{METADATA}: {left_out:,} entries of custom_data: {NOT_KEPT}"
     except ValueError as error:
         problem = f"{METADATA}: {error}"
-    listed = _items(content.get("relative_file_paths"), str)
-    topics = _items(content.get("topics_with_message_count"), dict)
+    listed = _list_of(content.get("relative_file_paths"), str)
+    topics = _list_of(content.get("topics_with_message_count"), dict)
     return BagMetadata(
         tuple(Path(name).name for name in listed),
         tuple(
@@ -339,7 +339,7 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
     ), problem
 
 
-def _items(value: object, kind: type[T]) -> list[T]:
+def _list_of(value: object, kind: type[T]) -> list[T]:
     return [item for item in value if isinstance(item, kind)] if isinstance(value, list) else []
 
 
@@ -409,13 +409,13 @@ def identify(
         with path.open("rb") as file:
             if not mcap_file.CONTAINER.claims(file.read(HEAD_BYTES)):
                 return None
-        state = state_of(path)
-        return IdentifiedFile(path, content_id([path], watch or unwatched), state)
+        state = file_state(path)
+        return IdentifiedFile(path, content_id([path], watch or no_progress), state)
     except OSError:  # opening the recording reports it
         return None
 
 
-def state_of(path: Path) -> tuple[int, ...]:
+def file_state(path: Path) -> tuple[int, ...]:
     """Return a file's inode, size and time of change, to detect changes."""
     state = path.stat()
     return state.st_ino, state.st_size, state.st_mtime_ns
@@ -446,16 +446,16 @@ def open_recording(
     """
     path = recording_path(path)
     distro = choose_definitions(definitions)  # before anything is opened
-    return _Opening(path, distro, salvage, watch or unwatched).open()
+    return _Opening(path, distro, salvage, watch or no_progress).open()
 
 
-def refuse_no_recording(path: Path) -> None:
+def reject_non_recording(path: Path) -> None:
     """Reject paths that are not recordings, by file name and magic bytes.
 
     Raises:
         RecordingError: the path is not a recording. Damage later in a file is not detected.
     """
-    opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
+    opening = _Opening(path, DEFAULT_DISTRO, False, no_progress)
     for file in opening.files():
         container_of(file)
 
@@ -492,7 +492,7 @@ class _Opening:
             if self.path.is_dir():
                 if folder_container(self.path):
                     return [self.path], BagMetadata()
-                return self._bag()
+                return self._find_bag_files()
             there = self.path.exists()
         except OSError as error:
             raise cannot_be_read(error, self.path) from error
@@ -508,7 +508,7 @@ class _Opening:
 
     def _open(self) -> Recording:
         files, metadata = self._files()
-        files = self._opened(files)
+        files = self._open_files(files)
         self._refuse_serialisation(metadata)
         self._compare(metadata, files)
         if files_of := self.containers[0].files:
@@ -521,7 +521,7 @@ class _Opening:
         recording.watch = self.watch
         return recording
 
-    def _opened(self, files: list[Path]) -> list[Path]:
+    def _open_files(self, files: list[Path]) -> list[Path]:
         """Open files; return those that opened. With `salvage`, the others count as damage."""
         opened, refused = [], []
         for file in files:
@@ -537,7 +537,7 @@ class _Opening:
             raise refused[0]
         return opened
 
-    def _bag(self) -> tuple[list[Path], BagMetadata]:
+    def _find_bag_files(self) -> tuple[list[Path], BagMetadata]:
         if not is_bag(self.path):
             raise RecordingError(
                 f"a folder that is not a bag: it has no {METADATA}",
@@ -556,7 +556,7 @@ class _Opening:
                 remedy="copy the whole folder",
             )
         self.missing, self.notes = missing, [*self.notes, *copies]
-        lacking = holes(files, from_zero=not metadata.files)
+        lacking = missing_numbers(files, from_zero=not metadata.files)
         if names := [name for name in lacking if name not in missing]:
             more = f" and {len(names) - 10:,} more" if len(names) > 10 else ""
             are = "is" if len(names) == 1 else "are"

@@ -30,9 +30,9 @@ from restock.ingest.containers.storage import (
     TopicInfo,
     TopicReading,
     Watch,
-    decompressed,
-    together,
-    unwatched,
+    decompress_batch,
+    join_small_batches,
+    no_progress,
 )
 from restock.ingest.decoding.columns import (
     CannotDecode,
@@ -57,11 +57,11 @@ class _Stream:
     def payloads(self) -> Iterator[bytes]:
         """Yield the serialised messages in file order, decompressed."""
         for _, batch in self.storage.batches([self.channel.id]):
-            for plain, _ in decompressed(batch):
+            for plain, _ in decompress_batch(batch):
                 yield from plain.payloads()
 
 
-def content_id(files: Sequence[Path], watch: Watch = unwatched) -> str:
+def content_id(files: Sequence[Path], watch: Watch = no_progress) -> str:
     """Return 16 hex digits of the BLAKE3 hash of files' sizes and contents, not their paths."""
     digest = blake3()  # with blake2b, hashing a bag with images took a third of its ingest
     done, whole = 0, sum(file.stat().st_size for file in files)
@@ -98,7 +98,7 @@ class Recording:
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
-        self.watch: Watch = unwatched  # called with the progress of a long read
+        self.watch: Watch = no_progress  # called with the progress of a long read
         self.robot: str | None = None  # namespace of the chosen robot, if it has several
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
@@ -111,7 +111,7 @@ class Recording:
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
-        several = map(self._several_types, sorted(self._streams))
+        several = map(self._note_several_types, sorted(self._streams))
         self.notes += [note for note in several if note]
 
     @cached_property
@@ -122,9 +122,9 @@ class Recording:
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
         """Return every topic by name, in alphabetical order."""
-        return {name: self._info(name) for name in sorted(self._streams)}
+        return {name: self._topic_info(name) for name in sorted(self._streams)}
 
-    def _info(self, name: str) -> TopicInfo:
+    def _topic_info(self, name: str) -> TopicInfo:
         streams = self._streams[name]
         first = streams[0].channel
         expected = sum(stream.storage.counts.get(stream.channel.id, 0) for stream in streams)
@@ -134,13 +134,13 @@ class Recording:
             source, skipped = "", str(reason)
         return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
 
-    def _several_types(self, topic: str) -> str | None:
+    def _note_several_types(self, topic: str) -> str | None:
         """Return a note if a topic's messages have several types: which, and which are read."""
         counts, read = Counter[str](), set[str]()
         for stream in self._streams[topic]:
             name = stream.channel.type
             counts[name] += stream.storage.counts.get(stream.channel.id, 0)
-            if self._alike(stream, self._streams[topic][0]):
+            if self._have_same_fields(stream, self._streams[topic][0]):
                 read.add(name)
         if len(counts := +counts) < 2:
             return None
@@ -151,7 +151,7 @@ class Recording:
             return said
         return f"{said}: only those of {', '.join(sorted(read))} are read"
 
-    def _alike(self, one: _Stream, other: _Stream) -> bool:
+    def _have_same_fields(self, one: _Stream, other: _Stream) -> bool:
         """Return whether two streams have the same type, or types with the same fields.
 
         For example, ROS 1 has both tf/tfMessage and tf2_msgs/TFMessage.
@@ -236,13 +236,13 @@ class Recording:
     def lost_messages(self) -> list[LostMessages]:
         """Return the losses in the files and in the topics that were read, each loss once."""
         damaged = {item.what for item in self.damage}
-        lost = [LostMessages(None, _count(item), item.what) for item in self._bag_damage]
+        lost = [LostMessages(None, _lost_count(item), item.what) for item in self._bag_damage]
         for storage in self._storages:
             for item in storage.damage:
                 of = {storage.channels.get(number) for number, n in item.messages.items() if n}
                 channel = of.pop() if len(of) == 1 else None
                 topic = channel.topic if channel else None
-                lost.append(LostMessages(topic, _count(item), item.what))
+                lost.append(LostMessages(topic, _lost_count(item), item.what))
         for account in self.accounts.values():
             lost += [
                 LostMessages(account.topic, count, why)
@@ -304,7 +304,7 @@ class Recording:
         self._expect_open()
         reading = TopicReading(self.topics[topic], fields)
         for storage in self._storages:
-            decoders = self._decoders(storage, topic, reading)
+            decoders = self._make_decoders(storage, topic, reading)
             for channel, batch in storage.batches(list(decoders)):
                 for plain, decoded in reading.decoded(decoders[channel].decode, batch):
                     yield plain.log_time_ns[decoded.rows], decoded.fields
@@ -327,30 +327,32 @@ class Recording:
         decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
-            found = self._decoders(storage, topic, reading)
+            found = self._make_decoders(storage, topic, reading)
             for decoder in found.values():
                 reading.use(decoder.empty())
             reading.interleaved |= len(found) > 1
             decoders |= found
             topics |= dict.fromkeys(found, topic)
-        for channel, batch in together(storage.batches(list(decoders))):
+        for channel, batch in join_small_batches(storage.batches(list(decoders))):
             readings[topics[channel]].take(decoders[channel].decode, batch)
             yield len(batch)
 
-    def _decoders(self, storage: Storage, topic: str, reading: TopicReading) -> dict[int, Decoder]:
+    def _make_decoders(
+        self, storage: Storage, topic: str, reading: TopicReading
+    ) -> dict[int, Decoder]:
         """Make the decoders of a topic's channels in one file; skip what cannot be decoded."""
         decoders: dict[int, Decoder] = {}
         for stream in self._streams[topic]:
             if stream.storage is storage:
                 try:
-                    decoders[stream.channel.id] = self._decoder(topic, stream, reading.paths)
+                    decoders[stream.channel.id] = self._make_decoder(topic, stream, reading.paths)
                 except CannotDecode as reason:
                     reading.skip(str(reason), storage.counts.get(stream.channel.id, 0))
         return decoders
 
-    def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
+    def _make_decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
         channel, kind = stream.channel, self._type(stream)
-        if not self._alike(stream, self._streams[topic][0]):
+        if not self._have_same_fields(stream, self._streams[topic][0]):
             raise CannotDecode(f"it carries both {self.topics[topic].type} and {channel.type}")
         try:
             leaves = [kind.leaf(path) for path in paths]
@@ -388,6 +390,6 @@ class Recording:
         self.close()
 
 
-def _count(damage: Damage) -> int | None:
+def _lost_count(damage: Damage) -> int | None:
     """Return the number of messages lost to damage; None if it is not known."""
     return sum(damage.messages.values()) or None

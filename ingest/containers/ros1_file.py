@@ -28,7 +28,7 @@ from restock.ingest.containers.chunks import (
     inflate,
     inflate_partly,
 )
-from restock.ingest.containers.storage import Container, Storage, Watch, unwatched
+from restock.ingest.containers.storage import Container, Storage, Watch, no_progress
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -119,14 +119,14 @@ class Ros1File(Storage):
         RecordingError: it is not such a bag, or is cut short or damaged (unless `salvage`).
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = no_progress) -> None:
         super().__init__()
         self._file = FileBytes(path)
         self._chunks: dict[int, StoredChunk] = {}  # by position in the file
         self._claimed: dict[int, Counter[int]] = {}  # chunk -> connection -> messages, by the end
         self._indexed: dict[int, Counter[int]] = {}  # … by the index after each chunk
         self._spans = list[tuple[int, int]]()
-        self._index_at, self._due = 0, (0, 0)  # position of the end; its connections, chunks
+        self._index_at, self._expected = 0, (0, 0)  # position of the end; its connections, chunks
         self._connections: dict[int, tuple[Fields, Fields]] = {}
         self._walks: dict[int, Walked] = {}
         self._room = MAX_REMEMBERED
@@ -186,7 +186,7 @@ class Ros1File(Storage):
                     self.damaged(what, self._claimed[at])
         if stop < end or any(chunk.stop == end for chunk in self._chunks.values()):
             return f"no index; damaged, or cut short, at byte {stop:,} of {end:,}"
-        whole = self._index_at and self._due == (len(self._connections), len(self._claimed))
+        whole = self._index_at and self._expected == (len(self._connections), len(self._claimed))
         return None if whole else "no index, or not all of it"
 
     def _take_records(self, start: int, watch: Watch) -> int:
@@ -201,7 +201,7 @@ class Ros1File(Storage):
                 break
             elif kind == RecordType.BAGHEADER:
                 self._index_at = _number(fields, b"index_pos")
-                self._due = _number(fields, b"conn_count"), _number(fields, b"chunk_count")
+                self._expected = _number(fields, b"conn_count"), _number(fields, b"chunk_count")
             elif kind == RecordType.IDXDATA and chunk >= 0:
                 self._indexed[chunk][_number(fields, b"conn")] += (after - data) // INDEX_ENTRY
             elif kind == RecordType.CONNECTION:
@@ -236,7 +236,7 @@ class Ros1File(Storage):
                 f"chunk at byte {at:,}: its index is damaged or wrong: read message by message"
             )
         try:
-            walked = self._walk(at, self._inflated(at))
+            walked = self._walk(at, self._inflate(at))
         except BadChunk:  # recorded as damage when the chunk is read
             return indexed | (claimed or Counter())
         for key, one in walked.connections.items():
@@ -245,7 +245,7 @@ class Ros1File(Storage):
         self._spans += [(int(one.min()), int(one.max())) for one in stamps]
         return Counter({key: len(rows) for key, rows in walked.places.items()})
 
-    def _inflated(self, at: int) -> bytes:
+    def _inflate(self, at: int) -> bytes:
         """Decompress a chunk's records.
 
         Raises:
@@ -285,7 +285,7 @@ class Ros1File(Storage):
                 continue
             counts = {key: self._counts[at][key] for key in sorted(self.channels)}
             try:
-                data = self._inflated(at)
+                data = self._inflate(at)
             except BadChunk as bad:
                 lost = {key: count for key, count in counts.items() if count}
                 self.damaged(f"chunk at byte {at:,} is lost: {bad}", lost)

@@ -25,7 +25,7 @@ from restock.ingest.containers.storage import (
     Storage,
     Watch,
     custom_data,
-    unwatched,
+    no_progress,
 )
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
@@ -45,7 +45,7 @@ _Pending = dict[int, tuple[list[bytes], list[int]]]  # topic id -> payloads, log
 
 
 def open_sqlite(
-    path: Path, *, salvage: bool = False, watch: Watch = unwatched
+    path: Path, *, salvage: bool = False, watch: Watch = no_progress
 ) -> SqliteFile | SalvagedSqliteFile:
     """Open a sqlite3 storage file.
 
@@ -57,7 +57,7 @@ def open_sqlite(
     except DamagedSqliteError as damage:
         if not salvage:
             raise
-        return SalvagedSqliteFile(path, damage.what, _merged(path))
+        return SalvagedSqliteFile(path, damage.what, _merge_copy(path))
 
 
 class DamagedSqliteError(RecordingError):
@@ -149,7 +149,7 @@ class SqliteFile(Storage):
             names = ", ".join(item.name for item in _sidecars(self.path))
             self.notes.append(f"{names}: also read, as the writer had not merged it")
         try:
-            connection = _connection(path, immutable)
+            connection = _open_connection(path, immutable)
             guard(connection, _size(self.path))
         except sqlite3.DatabaseError as error:
             raise DamagedSqliteError(str(error), self.path) from error
@@ -281,12 +281,12 @@ def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
     return folder
 
 
-def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
+def _merge_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
     """Copy a database and merge its sidecars as far as possible; None if it has no sidecars."""
     copy = _private_copy(path)
     if copy:
         with suppress(sqlite3.DatabaseError):
-            connection = _connection(Path(copy.name) / path.name, "")
+            connection = _open_connection(Path(copy.name) / path.name, "")
             try:
                 guard(connection, _size(path))
                 connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
@@ -295,7 +295,7 @@ def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
     return copy
 
 
-def _connection(path: Path, immutable: str) -> sqlite3.Connection:
+def _open_connection(path: Path, immutable: str) -> sqlite3.Connection:
     mode = "ro" if immutable else "rw"
     uri = f"file:{quote(os.fsencode(path.absolute()))}?mode={mode}{immutable}"
     return sqlite3.connect(uri, uri=True, check_same_thread=False)

@@ -159,7 +159,7 @@ def children(page: bytes) -> list[tuple[int, int]]:
     return found
 
 
-def moves_of(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
+def find_moves(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
     """Find how far pages moved, from the leaves (last row number, page) and interior pages.
 
     Only interior pages right above leaves are used: each of their row numbers is the last one of
@@ -278,7 +278,7 @@ class SalvagedSqliteFile(Storage):
             raise RecordingError(
                 f"{what}; and no topic can be found in what is left of it", where=str(path)
             )
-        self._rows = self._known(rows)
+        self._rows = self._drop_unknown_topics(rows)
         topics, counts = np.unique(self._rows[:, 1], return_counts=True)
         self.counts = dict.fromkeys(self.channels, 0)
         self.counts |= dict(zip(topics.tolist(), counts.tolist(), strict=True))
@@ -306,7 +306,7 @@ class SalvagedSqliteFile(Storage):
                 rows = []
         if rows:
             pieces.append(np.array(rows, np.int64))
-        self._moves = moves_of(leaves, interiors)
+        self._moves = find_moves(leaves, interiors)
         lasts = {last for last, _ in leaves}
         above = [below for below in interiors if any(key in lasts for _, key in below)]
         self._last = max((below[-1][1] for below in above), default=0)
@@ -345,7 +345,7 @@ class SalvagedSqliteFile(Storage):
             for number, (name, kind, encoding) in topics.items()
         }
 
-    def _known(self, rows: Ints) -> Ints:
+    def _drop_unknown_topics(self, rows: Ints) -> Ints:
         """Return the messages of known topics in the order of row numbers; the rest is damage."""
         _, first = np.unique(rows[:, 0], return_index=True)
         rows = rows[first]

@@ -50,7 +50,7 @@ _CUSTOM_DATA = re.compile(
 )
 
 
-def unwatched(doing: str, done: int, whole: int) -> None:
+def no_progress(doing: str, done: int, whole: int) -> None:
     """Ignore progress: a `Watch` that does nothing."""
 
 
@@ -223,7 +223,7 @@ CHUNK = 64 << 20  # bytes that are plausible for a chunk of any stored size: the
 FILE = 256 << 20  # the same for a file
 
 
-def most_bytes(stored: int, at_least: int = CHUNK) -> int:
+def max_plausible_bytes(stored: int, at_least: int = CHUNK) -> int:
     """Return the largest plausible size of `stored` compressed bytes."""
     return max(at_least, RATIO * stored)
 
@@ -234,7 +234,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     Raises:
         RecordingError: it is damaged or cut short (unless `salvage`), or implausibly large.
     """
-    limit = most_bytes(path.stat().st_size, FILE)
+    limit = max_plausible_bytes(path.stat().st_size, FILE)
     size = 0
     problem = None
     with path.open("rb") as source, target.open("wb") as sink:
@@ -262,7 +262,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     return problem
 
 
-def decompressed(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
+def decompress_batch(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
     """Yield the batch with zstd payloads decompressed, and the number of damaged payloads.
 
     It comes in pieces of about PIECE bytes, as it may be many times larger decompressed.
@@ -270,14 +270,14 @@ def decompressed(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
     The first four bytes of a payload show whether it is compressed: CDR starts with two zeros, or
     with a zero and another small number.
     """
-    if not _any_zstd(batch):
+    if not _has_zstd(batch):
         yield batch, 0
         return
     payloads, good, size, bad = list[bytes](), list[int](), 0, 0
     for row in range(len(batch)):
         payload = batch.buffer[batch.start[row] : batch.stop[row]].tobytes()
         try:
-            payloads.append(_plain(payload))
+            payloads.append(_decompress(payload))
             good.append(row)
             size += len(payloads[-1])
         except zstandard.ZstdError:
@@ -293,10 +293,10 @@ def _piece(batch: MessageBatch, payloads: list[bytes], good: list[int]) -> Messa
     return MessageBatch.of(payloads, batch.log_time_ns[rows], batch.publish_time_ns[rows])
 
 
-def _plain(payload: bytes) -> bytes:
+def _decompress(payload: bytes) -> bytes:
     if not payload.startswith(ZSTD_MAGIC):
         return payload
-    limit = min(most_bytes(len(payload)), MAX_MESSAGE)
+    limit = min(max_plausible_bytes(len(payload)), MAX_MESSAGE)
     size = zstandard.frame_content_size(payload)
     if 0 <= size <= limit:
         return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))
@@ -314,7 +314,7 @@ def _plain(payload: bytes) -> bytes:
     raise zstandard.ZstdError("cut short")
 
 
-def _any_zstd(batch: MessageBatch) -> bool:
+def _has_zstd(batch: MessageBatch) -> bool:
     long = batch.start[batch.stop - batch.start >= len(ZSTD_MAGIC)]
     long = long[batch.buffer[long] == ZSTD_MAGIC[0]]
     same = [batch.buffer[long + at] == byte for at, byte in enumerate(ZSTD_MAGIC)]
@@ -432,7 +432,7 @@ class TopicReading:
         """Decode a batch; yield its messages and their columns in pieces, and count both."""
         account = self._account
         account.read += len(batch)
-        for plain, damaged in decompressed(batch):
+        for plain, damaged in decompress_batch(batch):
             if damaged:
                 self._add({"its zstd data is damaged": damaged})
             sane = (plain.log_time_ns >= 0) & (plain.log_time_ns < LATEST_NS)
@@ -493,7 +493,9 @@ class TopicReading:
         return TopicColumns(log, publish, fields, lap)
 
 
-def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
+def join_small_batches(
+    batches: Iterable[tuple[int, MessageBatch]],
+) -> Iterator[tuple[int, MessageBatch]]:
     """Join small batches of a channel; its messages stay in order.
 
     Decoding has a cost per batch besides the cost per message, and a slow topic has only a handful

@@ -75,7 +75,7 @@ def types_in(content: bytes, name: str, form: str) -> Typesdict:
                 lines = own.join(_HEADER.split(lines))
             types.update(get_types_from_msg(lines, part))
     except (TypesysError, RecursionError, ValueError, LookupError) as error:
-        raise CannotDecode(f"cannot be parsed{_where(error)}") from error
+        raise CannotDecode(f"cannot be parsed{_parse_end(error)}") from error
     return types
 
 
@@ -87,7 +87,7 @@ def _idl_types(text: str) -> Typesdict:
     return get_types_from_idl(text) if text.strip() else {}
 
 
-def _where(error: Exception) -> str:
+def _parse_end(error: Exception) -> str:
     """Return where parsing ended, as the end of an error message.
 
     An error of rosbags has the whole text on one line, then the position, the text there, and
@@ -267,24 +267,24 @@ def message_type(channel: Channel, distro: str) -> RosType:
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > MAX_DEFINITION:
             raise CannotDecode(f"its definition of {len(channel.definition):,} bytes is too long")
-        return _embedded(name, channel.definition_format, channel.definition, distro)
+        return _embedded_type(name, channel.definition_format, channel.definition, distro)
     if name not in types:
         raise CannotDecode(
             f"unknown type {channel.type or '(unnamed)'}: not defined in the recording"
             f" nor in {distro!r} (--definitions PATH reads .msg and .idl files)"
         )
-    return _from_distro(name, distro)
+    return _distro_type(name, distro)
 
 
 @cache
-def _from_distro(name: str, distro: str) -> RosType:
+def _distro_type(name: str, distro: str) -> RosType:
     kind = RosType(name, distro, distro_types(distro))
     kind.leaves()  # refuses what is not supported
     return kind
 
 
 @lru_cache(KEPT)
-def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
+def _embedded_type(name: str, form: str, definition: bytes, distro: str) -> RosType:
     try:
         types = types_in(definition, name, form)
     except CannotDecode as error:
@@ -292,7 +292,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     if form == "ros1msg":  # time and duration are primitives there
         types = {**distro_types("ros1_noetic"), **types}
     source = "embedded"
-    missing = _named(types) - types.keys()
+    missing = _referenced_messages(types) - types.keys()
     if missing:  # some writers omit inner messages; if those differ, sizes will not fit
         types = {**distro_types(distro), **types}
         source = f"embedded, and {distro}"
@@ -301,7 +301,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     return kind
 
 
-def _named(types: Typesdict) -> set[str]:
+def _referenced_messages(types: Typesdict) -> set[str]:
     """Return the names of the messages that these types have as fields."""
     fields = [_field(*item) for _, items in types.values() for item in items]
     return {field.message for field in fields if field.message}

@@ -234,7 +234,7 @@ class JsonType(MessageType):
     def fields_of(self, name: str) -> Sequence[FieldType]:
         if self._fields is None:
             root = self._root
-            if not _complete(root):
+            if not _is_complete(root):
                 for payload in self.sample():
                     try:
                         _observe(root, parse(payload), 0)
@@ -318,13 +318,13 @@ class _Schema:
         return place
 
 
-def _complete(node: Node) -> bool:
+def _is_complete(node: Node) -> bool:
     """Return whether the schema defines everything, members and array items included."""
     if not node.declared or (node.kind == "object" and not node.members):
         return False
-    if node.kind == "array" and (node.items is None or not _complete(node.items)):
+    if node.kind == "array" and (node.items is None or not _is_complete(node.items)):
         return False
-    return all(map(_complete, node.members.values()))
+    return all(map(_is_complete, node.members.values()))
 
 
 def _observe(node: Node, value: Any, depth: int) -> None:
@@ -375,14 +375,14 @@ class _Fields:
         if node.kind == "array" and node.items and many is None:
             return self._field(path + "[]", name, node.items, Many(None))
         if node.kind == "object":
-            message = _time(node) or path
+            message = _time_message(node) or path
             self.add(message, node)
             return FieldType(name, None, message, many)
-        base = _base(node)
+        base = _base_kind(node)
         return FieldType(name, base, None, many) if base else None
 
 
-def _time(node: Node) -> str | None:
+def _time_message(node: Node) -> str | None:
     for names, kind in zip(TIMES, JsonType.times, strict=True):
         integers = all(
             inner.seen["integer"] > inner.seen["number"] for inner in node.members.values()
@@ -392,7 +392,7 @@ def _time(node: Node) -> str | None:
     return None
 
 
-def _base(node: Node) -> str | None:
+def _base_kind(node: Node) -> str | None:
     if node.kind == "integer" and not node.declared:
         return "int64" if EXACT < node.widest < 1 << 63 else "float64"
     return _KINDS.get(node.kind or "")

@@ -205,7 +205,7 @@ class PolicyNode:
         self._watch_group = ros.MutuallyExclusiveCallbackGroup()
         self._commanding = threading.Lock()  # so that no command follows the last stop
         self._decided_s = math.inf  # time of the last decision, by the steady clock
-        self._said = ""  # who drives, as last published
+        self._published_driver = ""  # who drives, as last published
         self._classes: dict[str, Any] = {}
         self._published: dict[str, Any] = {}
         self._reports: Any = None
@@ -252,7 +252,7 @@ class PolicyNode:
         if not self.shadow:
             kinds["command"] = (self.form.topic, self.form.type)
             kinds["behaviour"] = (BEHAVIOUR if reported is None else reported.topic, STRING)
-        self._said = ""
+        self._published_driver = ""
         self._classes = {name: self._class(kind) for name, (_, kind) in kinds.items()}
         heard = {topic: self._class(kind) for topic, kind in pilot.topics.items()}
         self._published = {
@@ -277,7 +277,10 @@ class PolicyNode:
         self._timers = [
             self.node.create_timer(task.control_period_s, self._tick),
             self.node.create_timer(
-                self.watchdog_s / 2, self._watch, callback_group=self._watch_group, clock=steady
+                self.watchdog_s / 2,
+                self._check_watchdog,
+                callback_group=self._watch_group,
+                clock=steady,
             ),
             self.node.create_timer(DIAGNOSTICS_S, self._report, clock=steady),
             self.node.create_timer(DISCOVERY_S, self._match_latched, clock=steady),
@@ -288,15 +291,15 @@ class PolicyNode:
     def activate(self) -> None:
         """Start to publish; the lifecycle publishers must be enabled already."""
         self._decided_s, self.active = time.monotonic(), True
-        self._say(self._own())
+        self._publish_driver(self._own_policy())
 
     def deactivate(self) -> None:
         """Publish a stop, then nothing more; the lifecycle publishers must still be enabled."""
         with self._commanding:
-            if self.active and self._drives():
+            if self.active and self._is_driving():
                 self._command(0.0, 0.0)
                 assert self.pilot is not None
-                self._say(self.pilot.profile.behaviour_policy)
+                self._publish_driver(self.pilot.profile.behaviour_policy)
                 self._await_delivery()
             self.active = False
 
@@ -365,9 +368,9 @@ class PolicyNode:
             if self.shadow:
                 return
             if decision.taken_over:
-                self._say("operator")
+                self._publish_driver("operator")
                 return
-            self._say(self._own())
+            self._publish_driver(self._own_policy())
             self._command(*((0.0, 0.0) if late else decision.command))
 
     def _publish_shadow(self, decision: Decision) -> None:
@@ -382,17 +385,17 @@ class PolicyNode:
             self._published["action"].publish(action)
             self._published["proposal"].publish(self._filled("proposal", *decision.proposal))
 
-    def _watch(self) -> None:
+    def _check_watchdog(self) -> None:
         """Publish a stop if ticks stop coming, because a decision hangs or the clock stands."""
         with self._commanding:
             if not self.active or self.pilot is None:
                 return
             if time.monotonic() - self._decided_s > self.watchdog_s:
                 self.pilot.counts["stop: watchdog"] += 1
-                if self._drives():
+                if self._is_driving():
                     self._command(0.0, 0.0)
 
-    def _drives(self) -> bool:
+    def _is_driving(self) -> bool:
         """Return whether its commands drive the robot."""
         return (
             not self.shadow and self.pilot is not None and not self.pilot.taken_over(self._now_ns())
@@ -407,14 +410,14 @@ class PolicyNode:
             message.header.stamp = self.node.get_clock().now().to_msg()
         return self.form.fill(message, speed_mps, yaw_rate_radps)
 
-    def _say(self, who: str) -> None:
+    def _publish_driver(self, who: str) -> None:
         """Publish who drives, once, latched for late subscribers."""
-        if not self.shadow and who != self._said:
+        if not self.shadow and who != self._published_driver:
             message = self._classes["behaviour"]()
-            message.data = self._said = who
+            message.data = self._published_driver = who
             self._published["behaviour"].publish(message)
 
-    def _own(self) -> str:
+    def _own_policy(self) -> str:
         assert self.pilot is not None
         return json.dumps({"policy": "restock", "version": self.pilot.policy.version})
 

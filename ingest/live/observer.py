@@ -74,7 +74,7 @@ class LiveClock:
 
 # Inputs that observations do not use.
 PROVENANCE = ("behaviour_policy", "true_condition", "true_exposure", "perturbation")
-_MOST = 2000  # limit of a topic's messages that wait for a tick
+_MAX_WAITING = 2000  # limit of a topic's messages that wait for a tick
 
 
 @dataclass(frozen=True)
@@ -159,15 +159,15 @@ class LiveObserver:
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
         latched = all(source.max_age_s is None for source in sources)
         fields = {path: _column(message, path) for path in paths}
-        fields |= _said(message, sources)
+        fields |= _estimate_flags(message, sources)
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
             return
         taken = _Message(log_time_ns, stamp_ns, fields)
         if topic != self.profile.inputs.command.topic:
             self._buffers[topic].append(taken)
-            if len(self._buffers[topic]) > _MOST:  # nobody calls `observe`
-                del self._buffers[topic][: _MOST // 2]
+            if len(self._buffers[topic]) > _MAX_WAITING:  # nobody calls `observe`
+                del self._buffers[topic][: _MAX_WAITING // 2]
         elif self._ticked:
             self._command, self._ticked = taken, False
 
@@ -269,7 +269,7 @@ def value_of(message: Any, path: str) -> Any:
     return value if place is None else value[place]
 
 
-def _said(message: Any, sources: Sequence[Input]) -> dict[str, FieldColumn]:
+def _estimate_flags(message: Any, sources: Sequence[Input]) -> dict[str, FieldColumn]:
     """Return the fields that mark a message as having no estimate, as columns of one row."""
     rules = (
         rule

@@ -99,13 +99,13 @@ class Pilot:
         try:
             for source in self._people:
                 if source.topic == topic:
-                    self._hear(source, message, now_ns)
+                    self._note_person(source, message, now_ns)
             if topic in self.observer.topics:
                 self.observer.receive(topic, message, now_ns)
         except OTHER_TYPE:
             self.unreadable[topic] += 1
 
-    def _hear(self, source: Input, message: Any, now_ns: int) -> None:
+    def _note_person(self, source: Input, message: Any, now_ns: int) -> None:
         path = source.fields.get("pressed")
         drives = path is None or bool(value_of(message, path))
         self._active_ns[source.topic] = now_ns if drives else None
@@ -228,7 +228,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
                     fired_ns, began_s = now_ns, time.perf_counter()
                     decision = pilot.decide(now_ns)
                     took_s = time.perf_counter() - began_s
-                    yield Played(now_ns, decision, took_s, _action(pilot, message))
+                    yield Played(now_ns, decision, took_s, _nearest_action(pilot, message))
                 pilot.receive(connection.topic, message, now_ns)
     except (
         *(AnyReaderError, SerdeError, rosbag1.ReaderError, rosbag2.ReaderError),
@@ -265,7 +265,7 @@ def summary(pilot: Pilot, played: list[Played]) -> dict[str, Any]:
     }
 
 
-def _action(pilot: Pilot, message: Any) -> int | None:
+def _nearest_action(pilot: Pilot, message: Any) -> int | None:
     command = pilot.profile.inputs.command
     try:
         speed = float(value_of(message, command.fields["speed_mps"]))

@@ -142,14 +142,14 @@ class OnnxFile:
                 raise _refusal(self.path, f"has other {key} in its metadata than {who}", again)
         taken, wanted = self._shapes[self._input], (ROWS, task.observation_size)
         if taken != wanted:
-            why = f"takes {_text(taken)}, the task's observation is {_text(wanted)}"
+            why = f"takes {_shape_text(taken)}, the task's observation is {_shape_text(wanted)}"
             raise _refusal(self.path, why, again)
         made = {name: self._shapes[name] for name in self._outputs}
         wanted = (ROWS, len(task.actions))
         self._values = next((name for name, shape in made.items() if shape == wanted), "")
         if not self._values:
-            every = ", ".join(f"{name} {_text(shape)}" for name, shape in made.items())
-            why = f"computes {every}, the task's action values are {_text(wanted)}"
+            every = ", ".join(f"{name} {_shape_text(shape)}" for name, shape in made.items())
+            why = f"computes {every}, the task's action values are {_shape_text(wanted)}"
             raise _refusal(self.path, why, again)
         try:
             self.values(np.zeros((1, task.observation_size), np.float32))
@@ -290,11 +290,11 @@ def graph_shapes(model: Any) -> dict[str, Shape]:
         try:
             shape = operator([shapes[name] for name in node.input], settings, values)
         except (ValueError, IndexError) as error:
-            every = ", ".join(_text(shapes[name]) for name in node.input)
+            every = ", ".join(_shape_text(shapes[name]) for name in node.input)
             raise ValueError(f"does not fit: {node.op_type} of {every}") from error
         width = math.prod(size for size in shape if not isinstance(size, str))
         if width > MAX_WIDTH or ROWS in shape[1:]:
-            raise ValueError(f"computes {_text(shape)}, more than {MAX_WIDTH} numbers a row")
+            raise ValueError(f"computes {_shape_text(shape)}, more than {MAX_WIDTH} numbers a row")
         add(node.output[0], shape)
     if unknown := [value.name for value in graph.output if value.name not in shapes]:
         raise ValueError(f"returns {unknown[0]!r}, which nothing computes")
@@ -308,7 +308,9 @@ def _constant(tensor: Any) -> NDArray[Any]:
         raise ValueError(f"has {tensor.name!r}: neither a matrix nor a vector of float32 or int64")
     size, held = math.prod(dims) * kind.itemsize, len(tensor.raw_data)
     if size != held:
-        raise ValueError(f"contains {held} of the {size} bytes of {tensor.name!r} {_text(dims)}")
+        raise ValueError(
+            f"contains {held} of the {size} bytes of {tensor.name!r} {_shape_text(dims)}"
+        )
     value: NDArray[Any] = np.frombuffer(tensor.raw_data, kind).reshape(dims)
     if not np.isfinite(value).all() and (dims or value != -np.inf):
         raise ValueError(f"has weights {tensor.name!r} that are not finite numbers")
@@ -321,11 +323,11 @@ def _constant(tensor: Any) -> NDArray[Any]:
 Rule = Callable[[Sequence[Shape], Mapping[str, float], Sequence[NDArray[Any] | None]], Shape]
 
 
-def _same(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
+def _same_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
     return shapes[0]
 
 
-def _broadcast(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
+def _broadcast_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
     rank = max(map(len, shapes))
     aligned = [(1,) * (rank - len(shape)) + shape for shape in shapes]
     result: list[int | str] = []
@@ -335,7 +337,7 @@ def _broadcast(shapes: Sequence[Shape], settings: Mapping[str, float], values: A
     return tuple(result)
 
 
-def _product(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
+def _product_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
     """Return the shape of (N, k) @ (k, m) [+ (m,)]; the second matrix may be transposed."""
     (rows, inner), (taken, width) = shapes[0], shapes[1][:: -1 if settings.get("transB") else 1]
     if inner != taken or settings.get("transA") or (len(shapes) == 3 and shapes[2] != (width,)):
@@ -343,7 +345,7 @@ def _product(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any
     return rows, width
 
 
-def _reduced(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
+def _reduced_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
     """Return the shape of (N, k) reduced along its second axis."""
     axes = np.array(values[1]).tolist() if len(shapes) == 2 else [settings.get("axis")]
     if len(shapes[0]) != 2 or axes not in ([1], [-1]):
@@ -352,27 +354,27 @@ def _reduced(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any
 
 
 ONNX_OPERATORS: dict[str, Rule] = {  # all operators that a policy may have
-    "Gemm": _product,
-    "MatMul": _product,
-    "LayerNormalization": _same,
-    "Relu": _same,
-    "Tanh": _same,
-    "Sigmoid": _same,
-    "Softmax": _same,
-    "Identity": _same,
-    "Add": _broadcast,
-    "Sub": _broadcast,
-    "Mul": _broadcast,
-    "Div": _broadcast,
-    "GreaterOrEqual": _broadcast,
-    "Where": _broadcast,
-    "ReduceMax": _reduced,
-    "ReduceMin": _reduced,
-    "ReduceSum": _reduced,
-    "ReduceMean": _reduced,
-    "ArgMax": _reduced,
+    "Gemm": _product_shape,
+    "MatMul": _product_shape,
+    "LayerNormalization": _same_shape,
+    "Relu": _same_shape,
+    "Tanh": _same_shape,
+    "Sigmoid": _same_shape,
+    "Softmax": _same_shape,
+    "Identity": _same_shape,
+    "Add": _broadcast_shape,
+    "Sub": _broadcast_shape,
+    "Mul": _broadcast_shape,
+    "Div": _broadcast_shape,
+    "GreaterOrEqual": _broadcast_shape,
+    "Where": _broadcast_shape,
+    "ReduceMax": _reduced_shape,
+    "ReduceMin": _reduced_shape,
+    "ReduceSum": _reduced_shape,
+    "ReduceMean": _reduced_shape,
+    "ArgMax": _reduced_shape,
 }
 
 
-def _text(shape: Shape) -> str:
+def _shape_text(shape: Shape) -> str:
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

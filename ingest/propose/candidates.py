@@ -88,7 +88,7 @@ def candidates(
             for path, words in _paths(recording, topic)
             if (topic.name, path) not in used
         ]
-        for one in _changing(recording, topic, possible)[:MAX_A_TOPIC]:
+        for one in _keep_changing(recording, topic, possible)[:MAX_A_TOPIC]:
             name, count = one.name, 2
             while name in named or name_problem(name):
                 name, count = f"{one.name}_{count}", count + 1
@@ -96,7 +96,9 @@ def candidates(
     return list(named.values())
 
 
-def _changing(recording: Recording, topic: TopicInfo, possible: list[Candidate]) -> list[Candidate]:
+def _keep_changing(
+    recording: Recording, topic: TopicInfo, possible: list[Candidate]
+) -> list[Candidate]:
     """Keep the candidates that take more than one value in the recording."""
     if not possible:
         return []
@@ -128,7 +130,7 @@ def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
             if isinstance(column, Ragged):
                 rows = np.flatnonzero((column.lengths == names.lengths) & (names.lengths > 0))
                 for name in np.unique(np.asarray(names.take(rows).values)).tolist():
-                    if _plain(name) and not _number(name):
+                    if _is_selectable(name) and not _is_number(name):
                         yield (f"{path}[{name}]",) * 2
         return
     status = "status[].name", "status[].values[].key", "status[].values[].value"
@@ -138,8 +140,8 @@ def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
         triples = zip(
             np.repeat(np.asarray(names), keys.lengths), keys.values, texts.values, strict=True
         )
-        for name, key in sorted({(n, k) for n, k, text in triples if _number(text)}):
-            if _plain(name) and _plain(key):
+        for name, key in sorted({(n, k) for n, k, text in triples if _is_number(text)}):
+            if _is_selectable(name) and _is_selectable(key):
                 yield f"status[name={name}].values[key={key}].value", f"{name}.{key}"
         return
     for path, field in fields.items():
@@ -157,12 +159,12 @@ def _candidate(topic: TopicInfo, path: str, words: str) -> Candidate:
     return Candidate(name if name[:1].isalpha() else f"s_{name}", topic, path, unit)
 
 
-def _plain(name: str) -> bool:
+def _is_selectable(name: str) -> bool:
     """Return whether a path can select an element by this name."""
     return name == name.strip() and not any(mark in name for mark in "]=")
 
 
-def _number(text: str) -> bool:
+def _is_number(text: str) -> bool:
     try:
         return bool(np.isfinite(float(text)))
     except ValueError:

@@ -213,17 +213,17 @@ def command_hold(
             still = moved[0] <= STANDS_M and moved[1] <= STANDS_RAD
             stood, went = stood + still, went + (not still)
             continue
-        moving = _last_moving(at, way, turned, begin, end, speed, turn, within)
+        moving = _followed_until(at, way, turned, begin, end, speed, turn, within)
         if moving is None:
             continue  # it never started: it was blocked, or it is not this robot's command
         if moving >= end - within / 2:
             on.append(end - begin)
         else:
             stopped.append(moving - begin)
-    return _judge(on, stopped, stood, went)
+    return _hold_shown(on, stopped, stood, went)
 
 
-def _last_moving(
+def _followed_until(
     at: F64,
     way: F64,
     turned: F64,
@@ -251,7 +251,7 @@ def _last_moving(
     return float(checked[broken[0] - 1] if len(broken) else checked[moving[-1]])
 
 
-def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:
+def _hold_shown(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:
     comments, age_s = [], None
     if on or stopped:
         age_s = min(max(on), MAX_S) if on else float(np.median(stopped))
@@ -415,7 +415,7 @@ def read_commands(
     return drive, commands, hold
 
 
-def how_it_turned(
+def turning_evidence(
     log: CommandLog | None, poses: PoseSeries | None
 ) -> tuple[DriveEvidence, float | None]:
     """Return how the robot turned under Twist commands.

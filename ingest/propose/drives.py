@@ -252,17 +252,17 @@ def propose_for_drives(
     if len(drives.paths) == 1:
         return propose_profile(recordings[0], name, given)
     evidence = [gather(recording, given) for recording in recordings]
-    seen = _best(evidence, evidence)
+    seen = _choose_evidence(evidence, evidence)
     usual = _trials(seen, evidence)
     giving = [one for one, trial in zip(evidence, usual, strict=True) if trial.transitions]
     if giving and not any(one.recording is seen.recording for one in giving):
-        seen = _best(giving, evidence)  # the fullest drive stood still, or had no goal
+        seen = _choose_evidence(giving, evidence)  # the fullest drive stood still, or had no goal
         usual = _trials(seen, evidence)
     dropped: Counter[str] = sum((Counter(trial.dropped) for trial in usual), Counter())
     goal = seen.goal.tried(sum(trial.transitions for trial in usual), dropped)
     proposal = propose_from(replace(seen, goal=goal), name, goal_decided=True)
     trials = [tried(one.recording, proposal.toml) for one in evidence]
-    advice = [*proposal.advice, *_left_out(drives, evidence, trials)]
+    advice = [*proposal.advice, *_advise_left_out(drives, evidence, trials)]
     transitions = sum(trial.transitions for trial in trials)
     lines = [
         f"# For {counted(len(drives.kinds[0]), 'drive')} of one kind of robot: {transitions:,}"
@@ -276,7 +276,7 @@ def propose_for_drives(
     ]
     return replace(
         proposal,
-        problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
+        problems=[*proposal.problems, *_report_other_drives(proposal.missing, evidence)],
         toml="\n".join([*lines, proposal.toml]),
         advice=advice,
         kinds=drives.robots,
@@ -285,10 +285,10 @@ def propose_for_drives(
     )
 
 
-def _best(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
+def _choose_evidence(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
     """Return evidence with one of `bases`: the one that turns most time of all drives into rows."""
     return max(
-        (pooled(base, drives) for base in _bases(bases)),
+        (pool_evidence(base, drives) for base in _bases(bases)),
         key=lambda one: (
             sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives))
             * (LOCALISED_WORTH if one.poses_from_frames and on_map(one.frames) else 1.0)
@@ -305,7 +305,7 @@ def _bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
+def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     """Return the evidence of one drive, with the robot's properties combined from all drives."""
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max((base, *drives), key=lambda one: len(one.robot.values))
@@ -398,7 +398,7 @@ def _name(path: Path) -> str:
     return "/".join(path.parts[-2:])
 
 
-def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
+def _report_other_drives(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
     """Report which other drives have an input that the profile's own drive lacks."""
     return [
         f"{_name(one.recording.path)} has a {role} ({one.roles[role][0][0].name}) and no {lacks}:"
@@ -409,7 +409,7 @@ def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]
     ]
 
 
-def _left_out(
+def _advise_left_out(
     drives: Drives, evidence: Sequence[Evidence], trials: Sequence[Trial]
 ) -> Iterator[Advice]:
     """Yield advice on recordings that were not read, give no rows, or are of another kind."""
@@ -525,7 +525,7 @@ def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
 
     Kinds are in the order of their first recording.
     """
-    rich_first = sorted(range(len(traits)), key=lambda one: (-_known(traits[one]), one))
+    rich_first = sorted(range(len(traits)), key=lambda one: (-_count_known(traits[one]), one))
     kinds: list[list[int]] = []
     for index in rich_first:
         fitting = [k for k in kinds if all(traits[index].fits(traits[other]) for other in k)]
@@ -536,7 +536,7 @@ def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
     return sorted(sorted(kind) for kind in kinds)
 
 
-def _known(traits: RobotTraits) -> int:
+def _count_known(traits: RobotTraits) -> int:
     reported = (traits.description, traits.lidar, traits.frames, traits.command)
     return sum(bool(each) for each in reported)
 

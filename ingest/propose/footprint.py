@@ -37,7 +37,7 @@ from restock.ingest.profile.description import (
 from restock.ingest.profile.signal_paths import frame_id_path, plain
 from restock.ingest.profile.tables import Input
 from restock.ingest.propose.pose_choice import mount_of, named_frames
-from restock.ingest.propose.roles import Kind, own_first, shared
+from restock.ingest.propose.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.frames import Edges, PoseSeries, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 
@@ -119,7 +119,7 @@ def descriptions(recording: Recording) -> Iterator[RobotText]:
     If the recording has several robots, those of the robot to propose for come first, then those
     of no robot in particular.
     """
-    for name in own_first(recording, recording.topics):
+    for name in sort_own_first(recording, recording.topics):
         topic = recording.topics[name]
         if topic.skipped or not topic.expected or topic.type != "std_msgs/msg/String":
             continue

@@ -22,8 +22,8 @@ from restock.ingest.propose.commands import (
     CommandLog,
     Commands,
     choose_command,
-    how_it_turned,
     read_commands,
+    turning_evidence,
 )
 from restock.ingest.propose.footprint import (
     GUESS,
@@ -210,7 +210,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    turned, command_rad = how_it_turned(chosen.log, poses)
+    turned, command_rad = turning_evidence(chosen.log, poses)
     robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     wheelbase_m = robot.values.get("wheelbase_m")
     driven, commands, hold = read_commands(

@@ -239,7 +239,7 @@ def propose_robot(
             continue
         if one.check:
             notes.append(f"{one.source}: {one.check}")
-        values = _sound(found.values, notes)
+        values = _keep_valid(found.values, notes)
         origin = dict.fromkeys(values, one.kind)
         notes += [f"{one.source}: {note}" for note in found.notes]
         break
@@ -253,7 +253,7 @@ def propose_robot(
     return RobotProposal(values, origin, notes)
 
 
-def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
+def _keep_valid(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     """Keep the values that a robot can have; add notes on the others."""
     kept = {}
     for key, value in values.items():

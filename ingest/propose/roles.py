@@ -227,7 +227,7 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
     Topics of Restock's node and of other robots are left out.
     """
     found = {name: topic for name, topic in _readable(recording) if name not in NODE_TOPICS}
-    return {name: found[name] for name in own_first(recording, found)}
+    return {name: found[name] for name in sort_own_first(recording, found)}
 
 
 def robots_in(recording: Recording) -> list[str]:
@@ -286,7 +286,7 @@ def choose_robot(recording: Recording, name: str) -> None:
     recording.robot = chosen
 
 
-def own_first(recording: Recording, names: Iterable[str]) -> list[str]:
+def sort_own_first(recording: Recording, names: Iterable[str]) -> list[str]:
     """Drop topics of other robots, and put topics without a robot's namespace last."""
     robots = tuple(f"{robot}/" for robot in robots_in(recording))
     kept = [name for name in names if not name.startswith(robots[1:])]

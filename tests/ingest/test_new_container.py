@@ -6,7 +6,7 @@ from pathlib import Path
 
 from restock.ingest.containers import open_recording as opening
 from restock.ingest.containers.open_recording import open_recording, recordings_in
-from restock.ingest.containers.storage import Container, Storage, Watch, unwatched
+from restock.ingest.containers.storage import Container, Storage, Watch, no_progress
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"#JSONLINES\n"
@@ -15,7 +15,7 @@ MAGIC = b"#JSONLINES\n"
 class JsonLines(Storage):
     """A line a message: its time and its JSON; all of one topic."""
 
-    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = no_progress) -> None:
         super().__init__()
         lines = [json.loads(line) for line in path.read_text().splitlines()[1:]]
         self.stamps = [line["ns"] for line in lines]

@@ -19,7 +19,7 @@ from support.long import one_in
 
 from restock.cli import main
 from restock.errors import RecordingError
-from restock.ingest.batch import IngestJob, ingest_all, side_by_side
+from restock.ingest.batch import IngestJob, ingest_all, run_in_workers
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
@@ -45,12 +45,12 @@ def _length(path: Path) -> int:
 
 def test_each_path_once_whoever_dies() -> None:
     names = ["slow", "a", "killed1", "bb", "ccc", "gone", "dddd", "killed2"]
-    found = side_by_side(_length, [Path(name) for name in names], 2, died=lambda path, code: code)
+    found = run_in_workers(_length, [Path(name) for name in names], 2, died=lambda path, code: code)
     assert sorted(found) == list(enumerate([4, 1, -9, 2, 3, 7, 4, -9]))
 
 
 def test_a_caller_that_stops_early_stops_the_work() -> None:
-    found = side_by_side(_length, [Path("a"), *[Path("slow")] * 50], 2, died=lambda *_: -1)
+    found = run_in_workers(_length, [Path("a"), *[Path("slow")] * 50], 2, died=lambda *_: -1)
     assert next(found) in ((0, 1), (1, 4))
     found.close()
     assert multiprocessing.active_children() == []

@@ -188,14 +188,14 @@ class ProfileCommand:
 
     def _open(self, path: Path | str) -> Recording:
         from restock.ingest.containers.open_recording import open_recording
-        from restock.ingest.containers.storage import unwatched
+        from restock.ingest.containers.storage import no_progress
         from restock.ingest.propose.roles import choose_robot
 
         with output.progress(f"opening {Path(path).name}", None) as advance:
             recording = open_recording(
                 path, definitions=self.definitions, salvage=self.salvage, watch=advance.part
             )
-        recording.watch = unwatched  # the progress bar has ended
+        recording.watch = no_progress  # the progress bar has ended
         if self.robot is not None:
             try:
                 choose_robot(recording, self.robot)

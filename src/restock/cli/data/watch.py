@@ -34,7 +34,7 @@ from restock.ingest.containers.open_recording import (
     read_metadata,
     recordings_in,
 )
-from restock.ingest.containers.storage import unwatched
+from restock.ingest.containers.storage import no_progress
 from restock.ingest.store.writer import StoreWriter
 from restock.process import was_interrupted
 from restock.replay.places import open_place
@@ -270,7 +270,7 @@ def incomplete(path: Path) -> str:
             return _unfinished(path)
         if container := folder_container(path):
             with suppress(RecordingError):  # which ingest reports
-                damage = container.open(path, salvage=True, watch=unwatched).damage
+                damage = container.open(path, salvage=True, watch=no_progress).damage
                 return damage[0].what if damage else ""
             return ""
         if not (path / METADATA).is_file():

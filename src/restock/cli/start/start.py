@@ -304,12 +304,12 @@ class StartCommand:
         Raises:
             RecordingError: nothing at a path looks like a recording, or no file is one.
         """
-        from restock.ingest.containers.open_recording import recordings_in, refuse_no_recording
+        from restock.ingest.containers.open_recording import recordings_in, reject_non_recording
 
         wrong: list[RecordingError] = []
         for path in [path for name in self.paths for path in recordings_in(name)]:
             try:
-                refuse_no_recording(path)
+                reject_non_recording(path)
                 return str(path)
             except RecordingError as error:
                 wrong.append(error)
