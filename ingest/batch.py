@@ -75,8 +75,8 @@ class IngestJob:
         from restock.ingest.pipeline import preparing
 
         try:
-            how = {**self.options, "watch": watch, "settle": settle}
-            return alone(preparing(path, self.profile, **how))
+            options = {**self.options, "watch": watch, "settle": settle}
+            return alone(preparing(path, self.profile, **options))
         except RestockError as error:
             return error
         except MemoryError:
@@ -119,12 +119,12 @@ class IngestJob:
             ids.add(recording_id)
 
         with suppress(Exception):  # `prepare` finds the recording and the error
-            how = {**self.options, **more, "settle": settle_first}
-            works = [preparing(path, self.profile, **how) for path in paths if len(paths) > 1]
-            for place, one in in_step(works):
-                if isinstance(one, Prepared | RestockError):
+            options = {**self.options, **more, "settle": settle_first}
+            works = [preparing(path, self.profile, **options) for path in paths if len(paths) > 1]
+            for place, outcome in in_step(works):
+                if isinstance(outcome, Prepared | RestockError):
                     del left[place]
-                    yield place, one
+                    yield place, outcome
         for place, path in left.items():
             yield place, self.prepare(path, **more)
 
@@ -155,28 +155,28 @@ def ingest_all(
     """
     from restock.ingest.pipeline import CommitGroup
 
-    taken = [Path(path) for path in paths]
-    here = replace(job)  # has its own writer: workers get `job` without what a writer has read
-    group = CommitGroup(here.writer)
-    some = min(workers, len(taken))
-    if some > 1:
-        read = _prepare_in_workers(job, taken, some, group)
+    recordings = [Path(path) for path in paths]
+    own_job = replace(job)  # has its own writer: workers get `job` without what a writer has read
+    group = CommitGroup(own_job.writer)
+    processes = min(workers, len(recordings))
+    if processes > 1:
+        outcomes = _prepare_in_workers(job, recordings, processes, group)
     else:
-        read = _prepare_serially(here, taken, group, watch)
+        outcomes = _prepare_serially(own_job, recordings, group, watch)
     next_up = 0
     try:
-        with closing(read):
-            for arrived in read:
+        with closing(outcomes):
+            for arrived in outcomes:
                 if arrived is None:
                     group.commit_if_due()
                 else:
                     group.add(*arrived)
                 while next_up in group.results:
-                    yield taken[next_up], group.results.pop(next_up)
+                    yield recordings[next_up], group.results.pop(next_up)
                     next_up += 1
         group.commit()
-        for place in range(next_up, len(taken)):
-            yield taken[place], group.results.pop(place)
+        for place in range(next_up, len(recordings)):
+            yield recordings[place], group.results.pop(place)
     finally:
         group.discard()
 
@@ -193,8 +193,8 @@ def _prepare_serially(
 
     for bundle in _bundles(paths, MAX_BUNDLE):
         several = [paths[place] for place in bundle]
-        for at, one in job.prepare_several(several, watch=watched, settle=group.settle):
-            yield bundle[at], one
+        for at, outcome in job.prepare_several(several, watch=watched, settle=group.settle):
+            yield bundle[at], outcome
 
 
 def _prepare_in_workers(
@@ -226,14 +226,14 @@ def _prepare_in_workers(
 def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
     """Group the indices of consecutive recordings, up to `most` and MAX_BUNDLE_BYTES each."""
     bundles: list[list[int]] = []
-    whole = 0
+    total = 0
     for place, path in enumerate(paths):
         size = _size(path)
-        if not bundles or len(bundles[-1]) >= most or whole + size > MAX_BUNDLE_BYTES:
+        if not bundles or len(bundles[-1]) >= most or total + size > MAX_BUNDLE_BYTES:
             bundles.append([])
-            whole = 0
+            total = 0
         bundles[-1].append(place)
-        whole += size
+        total += size
     return bundles
 
 
@@ -245,9 +245,9 @@ def out_of_memory(path: Path) -> RecordingError:
 
 
 def _died_error(path: Path, code: int) -> RecordingError:
-    how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
+    ending = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     return RecordingError(
-        f"the process that read it {how}",
+        f"the process that read it {ending}",
         where=str(path),
         remedy=f"if out of memory, use fewer --workers; then {RERUN}",
     )

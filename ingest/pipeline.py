@@ -133,9 +133,9 @@ def ingest(
             refused as a repeated drive. The store is unchanged.
         StoreError: the store cannot be written.
     """
-    how: dict[str, Any] = {"store": store, "force": force, "salvage": salvage, "watch": watch}
-    how |= {"definitions": definitions, "repeated": repeated, "tags": tags or {}}
-    prepared = alone(preparing(path, profile, **how))
+    options: dict[str, Any] = {"store": store, "force": force, "salvage": salvage, "watch": watch}
+    options |= {"definitions": definitions, "repeated": repeated, "tags": tags or {}}
+    prepared = alone(preparing(path, profile, **options))
     if store is None:
         return prepared.result
     (outcome,) = commit_all(store, [prepared])
@@ -169,9 +169,9 @@ def preparing(
         settle(file.recording_id)
         before = store.manifest(file.recording_id)
         if before is not None and _unchanged(before, profile):
-            said, stored = metadata_of(file.path), before.get("tags") or {}
-            if said is not None and not _has_other_robot(before, profile):
-                reported = resolve_tags(profile.tags, file.path, said, tags, stored)
+            metadata, stored = metadata_of(file.path), before.get("tags") or {}
+            if metadata is not None and not _has_other_robot(before, profile):
+                reported = resolve_tags(profile.tags, file.path, metadata, tags, stored)
                 if reported.tags == stored:
                     return Prepared(IngestResult(str(path), "unchanged", before))
     with open_recording(path, definitions=definitions, salvage=salvage, watch=watch) as recording:
@@ -196,8 +196,8 @@ def preparing(
             return Prepared(result, staged)
         try:
             reported = replace(reported, notes=[*reported.notes, *renamed])
-            one = _Ingest(str(path), recording, profile, reported, repeated, before)
-            return (yield from one.run(store))
+            work = _Ingest(str(path), recording, profile, reported, repeated, before)
+            return (yield from work.run(store))
         except RecordingError as error:
             if error.where:
                 raise
@@ -444,36 +444,36 @@ def commit_all(
     """
     outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
     group: dict[int, Prepared] = {}
-    for place, one in enumerate(prepared):
+    for place, item in enumerate(prepared):
         # A later ingest of the same recording replaces the earlier one, in a commit of its own.
         ids = {other.staged.recording_id for other in group.values() if other.staged}
-        if one.staged and one.staged.recording_id in ids:
+        if item.staged and item.staged.recording_id in ids:
             outcomes |= _commit(store, group)
             group = {}
-        if one.staged is None:
-            outcomes[place] = one.result
-        elif refused := _repeat_error(store, one, list(group.values())):
-            store.discard([one.staged])
+        if item.staged is None:
+            outcomes[place] = item.result
+        elif refused := _repeat_error(store, item, list(group.values())):
+            store.discard([item.staged])
             outcomes[place] = refused
         else:
-            group[place] = one
+            group[place] = item
     outcomes |= _commit(store, group)
     fold_if_many(store)
     return [outcomes[place] for place in range(len(prepared))]
 
 
 def _repeat_error(
-    store: StoreWriter, one: Prepared, before: Sequence[Prepared]
+    store: StoreWriter, prepared: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
     """Return an error if the recording repeats a drive of the store or of `before` and must not."""
-    if one.staged is None or one.repeated in (None, "keep"):
+    if prepared.staged is None or prepared.repeated in (None, "keep"):
         return None
-    ahead = [other.staged for other in before if other.staged]
+    earlier = [other.staged for other in before if other.staged]
     try:
-        found = store.repeated(one.staged, one.period_s, ahead=ahead)
+        found = store.repeated(prepared.staged, prepared.period_s, ahead=earlier)
     except StoreError as error:
         return error
-    if found is None or (one.repeated == "replace" and found.has_less):
+    if found is None or (prepared.repeated == "replace" and found.has_less):
         return None
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
     if found.has_less:  # it was ingested while still being written, or salvaged
@@ -482,7 +482,7 @@ def _repeat_error(
             "that one; then ingest this one again (--repeated replace does both), or keep both "
             "with --repeated keep"
         )
-    return RecordingError(str(found), where=one.result.path, remedy=remedy)
+    return RecordingError(str(found), where=prepared.result.path, remedy=remedy)
 
 
 def _removal(store: StoreWriter, recording_id: str) -> str:
@@ -522,18 +522,18 @@ def _commit(
 
 
 def _build_result(
-    store: StoreWriter, one: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
+    store: StoreWriter, prepared: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
 ) -> IngestResult | StoreError:
     """Build the result of a committed recording, ignoring the `later` ones of its commit."""
     repeats = None
-    if one.repeated is not None:
+    if prepared.repeated is not None:
         # Look after the commit: another process may have written the same drive meanwhile.
         try:
-            repeats = store.repeated(staged, one.period_s, aside={i.ingest_id for i in later})
+            repeats = store.repeated(staged, prepared.period_s, aside={i.ingest_id for i in later})
         except StoreError as error:
             return error
-    notes = list(one.result.notes)
-    if repeats is not None and one.repeated == "replace":
+    notes = list(prepared.result.notes)
+    if repeats is not None and prepared.repeated == "replace":
         try:
             replaced_by, note = _remove_part(store, repeats)
         except StoreError as error:
@@ -541,13 +541,13 @@ def _build_result(
         version = replaced_by or version
         notes.append(note)
     elif repeats is not None:
-        until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
+        text = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
         if repeats.has_less:
-            how = f"{_removal(store, repeats.recording_id)} removes that one, which holds less"
+            command = f"{_removal(store, repeats.recording_id)} removes that one, which holds less"
         else:
-            how = f"{_removal(store, staged.recording_id)} removes this one"
-        notes.append(f"{until} {how}")
-    return replace(one.result, version=version, repeats=repeats, notes=notes)
+            command = f"{_removal(store, staged.recording_id)} removes this one"
+        notes.append(f"{text} {command}")
+    return replace(prepared.result, version=version, repeats=repeats, notes=notes)
 
 
 def _remove_part(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
@@ -584,17 +584,17 @@ class CommitGroup:
         self._first: dict[str, IngestResult] = {}  # recording id -> its first result in this ingest
         self._last_s: float | None = None  # time of the last commit
 
-    def add(self, place: int, one: Prepared | RestockError) -> None:
+    def add(self, place: int, prepared: Prepared | RestockError) -> None:
         """Add a prepared recording or its error, and commit if it is time."""
-        if isinstance(one, RestockError):
-            self.results[place] = one
-        elif self.store is not None and (copy := self._copy(one.result)) is not None:
-            self.store.discard([one.staged] if one.staged else [])
+        if isinstance(prepared, RestockError):
+            self.results[place] = prepared
+        elif self.store is not None and (copy := self._copy(prepared.result)) is not None:
+            self.store.discard([prepared.staged] if prepared.staged else [])
             self.results[place] = copy
-        elif one.staged is None:
-            self.results[place] = one.result
+        elif prepared.staged is None:
+            self.results[place] = prepared.result
         else:
-            self.waiting[place] = one
+            self.waiting[place] = prepared
         self.commit_if_due()
 
     def _copy(self, result: IngestResult) -> IngestResult | None:

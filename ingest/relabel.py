@@ -340,14 +340,14 @@ def _build_outcome(
     moments = Moments.of(before, row["clock_offset_ns"])
     changed = {}
     for name in dict.fromkeys(c.condition for c in given if c.condition in names):
-        said = np.zeros(len(before), np.bool_)
+        judged = np.zeros(len(before), np.bool_)
         for correction in given:
             if correction.condition == name:
-                said |= moments.covered(correction)
+                judged |= moments.covered(correction)
         changed[name] = Changed(
             int((now[name] & ~was[name]).sum()),
             int((was[name] & ~now[name]).sum()),
-            int((said & (was[name] == now[name])).sum()),
+            int((judged & (was[name] == now[name])).sum()),
         )
     return Corrected(
         row["recording_id"],

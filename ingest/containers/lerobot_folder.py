@@ -88,8 +88,8 @@ class LeRobotFolder(Storage):
                 else None,
             )
         robot = info.get("robot_type")
-        said = keep_entries({"robot_type": robot} if isinstance(robot, str) else {})[0]
-        self.metadata = [Metadata(LEROBOT_INFO, "", said)]
+        entries = keep_entries({"robot_type": robot} if isinstance(robot, str) else {})[0]
+        self.metadata = [Metadata(LEROBOT_INFO, "", entries)]
         self._features = dict(enumerate(self._read_features(info.get("features")), 2))
         self.channels = {1: Channel(1, FRAME, "lerobot/msg/Frame", "cdr", "ros2msg", _FRAME)}
         for number, feature in self._features.items():

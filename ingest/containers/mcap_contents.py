@@ -198,17 +198,17 @@ def _add_extra(contents: Contents, extra: Extra) -> None:
         contents.unnamed += 1
 
 
-def _add_metadata(contents: Contents, file: str, name: str, said: dict[str, str]) -> None:
+def _add_metadata(contents: Contents, file: str, name: str, record: dict[str, str]) -> None:
     """Keep the entries of a metadata record.
 
     rosbag2 writes its metadata.yaml into one when it opens the file and again when it closes it:
     the last one is kept.
     """
     if name == ROSBAG2:
-        contents.rosbag2 = said.get("serialized_metadata", "")
+        contents.rosbag2 = record.get("serialized_metadata", "")
         return
-    entries, beyond = keep_entries(said, contents.metadata)
-    contents.left_out += beyond
+    entries, left_out = keep_entries(record, contents.metadata)
+    contents.left_out += left_out
     if entries:
         source = f"metadata record {visible(name)!r} of {file}"
         contents.metadata.append(Metadata(source, name, entries))

@@ -631,9 +631,9 @@ class _Opening:
                 self.notes.append(f"{what}; every message that it counts is in the other files")
             else:
                 self.damage.append(Damage(what))
-        held = [sum(storage.counts.values()) for storage in self.storages]
-        for file, here, later in zip(files, held, range(1, len(held) + 1), strict=True):
-            if not here and any(held[later:]) and not whole:  # rosbag2 never starts an empty file
+        in_files = [sum(storage.counts.values()) for storage in self.storages]
+        for file, count, later in zip(files, in_files, range(1, len(in_files) + 1), strict=True):
+            if not count and any(in_files[later:]) and not whole:  # rosbag2 starts none
                 self.damage.append(Damage(f"{file.name} holds no message"))
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:

@@ -144,12 +144,12 @@ class Recording:
                 read.add(name)
         if len(counts := +counts) < 2:
             return None
-        of = [f"{count:,} of {name}" for name, count in counts.items()]
-        of[0] = of[0].replace(" of ", " messages of ", 1)
-        said = f"{topic} has {len(counts)} types: {', '.join(of)}"
+        parts = [f"{count:,} of {name}" for name, count in counts.items()]
+        parts[0] = parts[0].replace(" of ", " messages of ", 1)
+        note = f"{topic} has {len(counts)} types: {', '.join(parts)}"
         if counts.keys() <= read:
-            return said
-        return f"{said}: only those of {', '.join(sorted(read))} are read"
+            return note
+        return f"{note}: only those of {', '.join(sorted(read))} are read"
 
     def _have_same_fields(self, one: _Stream, other: _Stream) -> bool:
         """Return whether two streams have the same type, or types with the same fields.

@@ -88,13 +88,13 @@ class Metadata(NamedTuple):
 
 
 def keep_entries(
-    said: Mapping[str, str], kept: Collection[Metadata] = ()
+    record: Mapping[str, str], kept: Collection[Metadata] = ()
 ) -> tuple[dict[str, str], int]:
     """Return the entries within the limits, `kept` ones included, and the number left out."""
     room = MAX_ENTRIES - sum(len(item.entries) for item in kept)
-    short = {n: v for n, v in said.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
+    short = {n: v for n, v in record.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
     entries = dict(list(short.items())[: max(room, 0)])
-    return {visible(n): visible(v) for n, v in entries.items()}, len(said) - len(entries)
+    return {visible(n): visible(v) for n, v in entries.items()}, len(record) - len(entries)
 
 
 def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tuple[Metadata, int]:
@@ -106,9 +106,9 @@ def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tupl
     Raises:
         ValueError: it is too long, or not valid YAML.
     """
-    said, no_text = _custom_data(text)
-    entries, beyond = keep_entries(said, kept)
-    return Metadata(f"custom_data in {source}", "", entries), no_text + beyond
+    record, not_text = _custom_data(text)
+    entries, beyond = keep_entries(record, kept)
+    return Metadata(f"custom_data in {source}", "", entries), not_text + beyond
 
 
 def _custom_data(text: str) -> tuple[dict[str, str], int]:
@@ -125,13 +125,13 @@ def _custom_data(text: str) -> tuple[dict[str, str], int]:
     if len(lines) > MAX_CUSTOM_DATA:
         raise ValueError(f"custom_data has {len(lines):,} characters: not read")
     try:
-        said = yaml_value(lines.strip(), "custom_data", kind="base")
+        values = yaml_value(lines.strip(), "custom_data", kind="base")
     except ValueError as error:
         raise ValueError(f"custom_data cannot be used: {error}") from error
-    if not isinstance(said, dict):
+    if not isinstance(values, dict):
         return {}, 1
-    entries = {n: v for n, v in said.items() if isinstance(n, str) and isinstance(v, str)}
-    return {n: v for n, v in entries.items() if v != "~"}, len(said) - len(entries)
+    entries = {n: v for n, v in values.items() if isinstance(n, str) and isinstance(v, str)}
+    return {n: v for n, v in entries.items() if v != "~"}, len(values) - len(entries)
 
 
 def yaml_value(text: str, key: str, *, kind: str = "safe") -> Any:

@@ -81,8 +81,8 @@ def types_in(content: bytes, name: str, form: str) -> Typesdict:
 
 def _idl_types(text: str) -> Typesdict:
     text = _ASIDE.sub(lambda found: '""' if found["string"] else " ", text)
-    bare = _ANNOTATION.sub(" ", text)
-    if "(" in bare or _NESTED.search(bare):
+    plain = _ANNOTATION.sub(" ", text)
+    if "(" in plain or _NESTED.search(plain):
         raise CannotDecode("nests brackets, which is not supported")
     return get_types_from_idl(text) if text.strip() else {}
 
@@ -211,8 +211,8 @@ def distro_types(distro: str) -> Typesdict:
         RecordingError: there are no definitions in the folder, or one cannot be read.
     """
     name, _, folder = distro.partition("+")
-    hand = folder_types(folder) if folder else {}
-    return {**ackermann_types(), **_distro_store(name).fielddefs, **hand}
+    own = folder_types(folder) if folder else {}
+    return {**ackermann_types(), **_distro_store(name).fielddefs, **own}
 
 
 def choose_definitions(definitions: str | None) -> str:

@@ -104,17 +104,17 @@ def with_node_topics(profile: Profile) -> Profile:
         return CustomSignal(topic, kind, path, unit, max_age_s=age_s, doc=doc)
 
     rules = ", ".join(f"{number} {rule}" for number, rule in enumerate(RULES))
-    said = "of the command that the policy would have sent, after its limiter"
+    subject = "of the command that the policy would have sent, after its limiter"
     signals = {
         "shadow_action": signal(
             ACTION, "std_msgs/msg/Int16", "data", "1", "index of the action that it proposed"
         ),
-        "shadow_speed_mps": signal(SHADOW, form.type, form.speed, "m/s", f"speed {said}"),
+        "shadow_speed_mps": signal(SHADOW, form.type, form.speed, "m/s", f"speed {subject}"),
         "limiter_rule": signal(LIMITER, "std_msgs/msg/UInt8", "data", "1", rules),
     }
     if form.wheelbase_m is None:
         signals["shadow_yaw_rate_radps"] = signal(
-            SHADOW, form.type, form.turn, "rad/s", f"yaw rate {said}"
+            SHADOW, form.type, form.turn, "rad/s", f"yaw rate {subject}"
         )
     doc = "The limiter held back what the policy proposed."
     held = "coalesce(limiter_rule, 0) > 0"
@@ -254,7 +254,7 @@ class PolicyNode:
             kinds["behaviour"] = (BEHAVIOUR if reported is None else reported.topic, STRING)
         self._published_driver = ""
         self._classes = {name: self._class(kind) for name, (_, kind) in kinds.items()}
-        heard = {topic: self._class(kind) for topic, kind in pilot.topics.items()}
+        classes = {topic: self._class(kind) for topic, kind in pilot.topics.items()}
         self._published = {
             name: self.node.create_lifecycle_publisher(
                 self._classes[name],
@@ -268,9 +268,9 @@ class PolicyNode:
         self.pilot = pilot
         self._subscriptions = {
             topic: self._subscribe(topic, kind, quality(self.ros, 10, reliable=False))
-            for topic, kind in heard.items()
+            for topic, kind in classes.items()
         }
-        self._latching = {topic: heard[topic] for topic in sorted(pilot.latched)}
+        self._latching = {topic: classes[topic] for topic in sorted(pilot.latched)}
         self._match_latched()
         # Control ticks are by the node's clock, which obeys use_sim_time; the rest by a steady one.
         steady = self.ros.Clock(clock_type=self.ros.ClockType.STEADY_TIME)
