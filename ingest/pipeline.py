@@ -389,9 +389,9 @@ class _Ingest:
         notes += [one.reported for one in steps.findings if one.repaired]
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(
-                f"in place of its {self.before['transitions']:,} transitions by the profile"
-                f" {other!r}: a store keeps one set of rows per recording (ingest another robot's "
-                "rows of it into another --store)"
+                f"replaces its {self.before['transitions']:,} transitions of the profile {other!r}:"
+                " a store keeps one set of rows per recording (to keep both, as for several robots"
+                " in it, ingest into another --store)"
             )
         if clock.pace is not None:
             notes.append(
@@ -413,8 +413,8 @@ class _Ingest:
                 f"{topic}: {counted(count, 'message')} older than the recording, put at log time"
             )
         if steps.commands_between:
-            closer = counted(steps.commands_between, "command")
-            notes.append(f"{closer} closer than a control period: no step")
+            skipped = counted(steps.commands_between, "command")
+            notes.append(f"{skipped} gave no step: less than 3/4 of a period after the last tick")
         residual = table["action_residual"].to_numpy()
         far = int((residual > 0.25).sum())
         if far:

@@ -311,7 +311,7 @@ class PolicyNode:
             except RuntimeError:  # this middleware does not support it
                 continue
             if not acked:
-                self._log(f"last {name}: not all who listen had it within {ACKED_S:g} s")
+                self._log(f"last {name}: not all subscribers received it within {ACKED_S:g} s")
 
     def cleanup(self) -> None:
         """Destroy what `configure` created."""

@@ -368,7 +368,8 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     periods = [one.clock.period_s for one in usable]
     if max(periods) > SAME_PACE * min(periods):
         middle = drivable(float(np.median(periods)))
-        why = f"a tick every period, as the drives' are {min(periods):g} to {max(periods):g} s"
+        span = f"{min(periods):g} to {max(periods):g} s"
+        why = f"one tick per period, as the periods of the drives are {span}"
         usable = [replace(one, clock=_at_rate(one.clock, middle, why)) for one in usable]
     bases: dict[tuple[str, str, bool], Evidence] = {}
     for one in usable:

@@ -281,7 +281,7 @@ def choose_robot(recording: Recording, name: str) -> None:
             where=str(recording.path),
             remedy=f"its robots are {', '.join(robots)}"
             if robots
-            else "it seems to be of one: name none",
+            else "it seems to have a single robot: omit --robot",
         )
     recording.robot = chosen
 

@@ -78,9 +78,7 @@ def test_unchanged_is_left_alone_and_changed_is_replaced(bag, tmp_path, run):
     code, said, _ = run(bag, "--store", store, "--profile", other)
     assert (code, said["recordings"][0]["status"]) == (0, "written")
     # As where a recording holds several robots, each with its profile.
-    replaced = (
-        "in place of its 29 transitions by the profile 'warehouse_amr': a store keeps one set"
-    )
+    replaced = "replaces its 29 transitions of the profile 'warehouse_amr': a store keeps one set"
     assert [note for note in said["recordings"][0]["notes"] if note.startswith(replaced)]
     with Store(store) as opened:
         ((rows, hashes),) = opened.sql(
