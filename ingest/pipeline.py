@@ -77,11 +77,11 @@ class IngestResult:
     status: Status
     manifest: dict[str, Any]  # the row of `recordings`, as plain values
     messages: dict[str, int] = field(default_factory=dict)  # expected, decoded and unused ones
-    conditions: dict[str, int] = field(default_factory=dict)  # transitions on which a label holds
-    named: dict[str, int] = field(default_factory=dict)  # transitions with it as their `condition`
-    exposures: dict[str, int] = field(default_factory=dict)  # transitions in this exposure
+    conditions: dict[str, int] = field(default_factory=dict)  # label -> transitions it holds on
+    named: dict[str, int] = field(default_factory=dict)  # … that have it as their `condition`
+    exposures: dict[str, int] = field(default_factory=dict)  # exposure -> transitions in it
     scores: list[LabelScore] = field(default_factory=list)
-    endings: dict[str, int] = field(default_factory=dict)  # number of episodes by how they ended
+    endings: dict[str, int] = field(default_factory=dict)  # ending -> number of episodes
     lost_messages: list[str] = field(default_factory=list)  # lost messages or bytes, and why
     contradictions: list[str] = field(default_factory=list)  # between topics; the rows keep them
     notes: list[str] = field(default_factory=list)
@@ -465,7 +465,7 @@ def commit_all(
 def _repeat_error(
     store: StoreWriter, prepared: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
-    """Return an error if the recording repeats a drive of the store or of `before` and must not."""
+    """Return an error if a repeated drive is refused; search the store and `before` for it."""
     if prepared.staged is None or prepared.repeated in (None, "keep"):
         return None
     earlier = [other.staged for other in before if other.staged]
@@ -527,7 +527,7 @@ def _build_result(
     """Build the result of a committed recording, ignoring the `later` ones of its commit."""
     repeats = None
     if prepared.repeated is not None:
-        # Look after the commit: another process may have written the same drive meanwhile.
+        # Search only now, as another process may have written the same drive before the commit.
         try:
             repeats = store.repeated(staged, prepared.period_s, aside={i.ingest_id for i in later})
         except StoreError as error:

@@ -123,8 +123,9 @@ class Ros1File(Storage):
         super().__init__()
         self._file = FileBytes(path)
         self._chunks: dict[int, StoredChunk] = {}  # by position in the file
-        self._claimed: dict[int, Counter[int]] = {}  # chunk -> connection -> messages, by the end
-        self._indexed: dict[int, Counter[int]] = {}  # … by the index after each chunk
+        # Chunk -> number of messages per connection: by the end of the file, by each chunk's index.
+        self._claimed: dict[int, Counter[int]] = {}
+        self._indexed: dict[int, Counter[int]] = {}
         self._spans = list[tuple[int, int]]()
         self._index_at, self._expected = 0, (0, 0)  # position of the end; its connections, chunks
         self._connections: dict[int, tuple[Fields, Fields]] = {}

@@ -401,6 +401,6 @@ def _is_message(types: tuple[int, ...]) -> bool:
         and types[0] == 0
         and types[1] in INT_SIZES
         and types[2] in INT_SIZES
-        and types[3] >= 12  # a blob is even, a text odd
+        and types[3] >= 12  # even: a blob; odd: a text
         and types[3] % 2 == 0
     )

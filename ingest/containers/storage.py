@@ -342,7 +342,7 @@ class TopicInfo:
     skipped: str | None  # why it cannot be decoded, or None
 
 
-FAR_BACK_NS = 100_000_000  # log time that goes back further within a topic was set back
+FAR_BACK_NS = 100_000_000  # if a topic's log time goes back further, its clock was set back
 
 
 @dataclass

@@ -62,7 +62,7 @@ class Decoder(Protocol):
 
 
 class Unparsable(Exception):
-    """A message that does not fit its type. The reason, by which it is counted, has no values."""
+    """A message that does not fit its type. Its reason quotes no values, so equal ones add up."""
 
 
 class Parser(Protocol):

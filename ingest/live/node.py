@@ -386,7 +386,7 @@ class PolicyNode:
             self._published["proposal"].publish(self._filled("proposal", *decision.proposal))
 
     def _check_watchdog(self) -> None:
-        """Publish a stop if ticks stop coming, because a decision hangs or the clock stands."""
+        """Publish a stop if ticks stop coming, because a decision hangs or the clock stopped."""
         with self._commanding:
             if not self.active or self.pilot is None:
                 return
