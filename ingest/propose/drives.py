@@ -104,15 +104,15 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         problems.append(seen.motion.problem)
     trial = Trial()
     if not problems:
-        trial = trial_of(seen)
+        trial = try_evidence(seen)
         if trial.problem and BY_LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.gaps, trial.problem))
-            trial = trial_of(seen)
+            trial = try_evidence(seen)
         seen, trial = _by_rate(*_without_contradicted(seen, trial))
-        goal = seen.goal.tried(trial.transitions, trial.dropped)
+        goal = seen.goal.after_trial(trial.transitions, trial.dropped)
         if goal != seen.goal and not goal_decided:
             seen = replace(seen, goal=goal)
-            trial = trial_of(seen)
+            trial = try_evidence(seen)
         if trial.problem:
             problems.append(trial.problem)
     advice = [*advice_of(seen), *trial.advice]
@@ -138,7 +138,7 @@ def _without_contradicted(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial
         other = without_first(seen, roles[off[0].kind], why)
         if other is None:
             break
-        seen, trial = other, trial_of(other)
+        seen, trial = other, try_evidence(other)
     return seen, trial
 
 
@@ -152,7 +152,7 @@ def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
     if clock.steps != "command":
         return seen, trial
     goalless = replace(seen, goal=GoalChoice(None))  # as pauses may also cost the drive its goals
-    now, other = trial_of(goalless), trial_of(replace(goalless, clock=clock.at_a_rate()))
+    now, other = try_evidence(goalless), try_evidence(replace(goalless, clock=clock.at_a_rate()))
     longer = other.seconds > GAIN * now.seconds
     evener = other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds
     if other.problem or not (longer or evener):
@@ -163,15 +163,15 @@ def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
     )
     rate = replace(clock.at_a_rate(), comments=(*clock.comments, why))
     seen = replace(seen, clock=rate)
-    return seen, trial_of(seen)
+    return seen, try_evidence(seen)
 
 
-def trial_of(seen: Evidence, recording: Recording | None = None) -> Trial:
+def try_evidence(seen: Evidence, recording: Recording | None = None) -> Trial:
     """Try the profile that `seen` leads to on a recording, by default on its own."""
-    return tried(recording or seen.recording, "\n".join(profile_lines(seen, "robot")))
+    return try_toml(recording or seen.recording, "\n".join(profile_lines(seen, "robot")))
 
 
-def tried(recording: Recording, toml: str) -> Trial:
+def try_toml(recording: Recording, toml: str) -> Trial:
     """Try the profile of this TOML on the recording."""
     try:
         profile = as_recorded(parse_profile(toml, where="the proposal"), recording.topics)
@@ -259,9 +259,9 @@ def propose_for_drives(
         seen = _choose_evidence(giving, evidence)  # the fullest drive stood still, or had no goal
         usual = _trials(seen, evidence)
     dropped: Counter[str] = sum((Counter(trial.dropped) for trial in usual), Counter())
-    goal = seen.goal.tried(sum(trial.transitions for trial in usual), dropped)
+    goal = seen.goal.after_trial(sum(trial.transitions for trial in usual), dropped)
     proposal = propose_from(replace(seen, goal=goal), name, goal_decided=True)
-    trials = [tried(one.recording, proposal.toml) for one in evidence]
+    trials = [try_toml(one.recording, proposal.toml) for one in evidence]
     advice = [*proposal.advice, *_advise_left_out(drives, evidence, trials)]
     transitions = sum(trial.transitions for trial in trials)
     lines = [
@@ -297,7 +297,7 @@ def _choose_evidence(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> E
 
 
 def _trials(seen: Evidence, drives: Sequence[Evidence]) -> list[Trial]:
-    return [trial_of(seen, one.recording) for one in drives]
+    return [try_evidence(seen, one.recording) for one in drives]
 
 
 def _bytes(path: Path) -> int:

@@ -37,7 +37,7 @@ from restock.ingest.profile.description import (
 from restock.ingest.profile.signal_paths import frame_id_path, plain
 from restock.ingest.profile.tables import Input
 from restock.ingest.propose.pose_choice import mount_of, named_frames
-from restock.ingest.propose.roles import Kind, shared, sort_own_first
+from restock.ingest.propose.roles import Kind, sharing_warning, sort_own_first
 from restock.ingest.steps.frames import Edges, PoseSeries, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 
@@ -127,7 +127,7 @@ def descriptions(recording: Recording) -> Iterator[RobotText]:
             continue
         texts = np.asarray(recording.read({name: ["data"]})[name].fields["data"], object)
         for text in texts[-1:]:
-            yield RobotText(name, str(text), check=shared(recording, name))
+            yield RobotText(name, str(text), check=sharing_warning(recording, name))
 
 
 def footprint_of(

@@ -72,7 +72,7 @@ class GoalChoice:
     why: str = ""  # why there is none
     hindsight_wanted: bool = False  # even if most of the drive has no goal in hindsight
 
-    def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
+    def after_trial(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
         """Return the choice after a trial.
 
         The goal is dropped if hindsight finds none for most of the drive or, if hindsight is

@@ -293,7 +293,7 @@ def sort_own_first(recording: Recording, names: Iterable[str]) -> list[str]:
     return sorted(kept, key=lambda name: not name.startswith(robots[:1]))
 
 
-def shared(recording: Recording, place: str) -> str:
+def sharing_warning(recording: Recording, place: str) -> str:
     """Return a warning if a topic may be another robot's, or ""."""
     robots = robots_in(recording)[:1]
     if not robots or place.startswith(f"{robots[0]}/"):

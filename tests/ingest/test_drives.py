@@ -20,7 +20,7 @@ from restock.ingest.propose.drives import (
     propose_for_drives,
     robot_kinds,
     robot_traits,
-    tried,
+    try_toml,
 )
 
 TWIST = "geometry_msgs/msg/Twist"
@@ -186,6 +186,6 @@ def test_where_one_drive_has_no_map_odometry_serves_all():
         assert profile.frames is None
         assert profile.inputs.pose is not None
         assert profile.inputs.pose.topic == "/odom"
-        rows = [tried(one, proposal.toml).transitions for one in (mapped, without)]
+        rows = [try_toml(one, proposal.toml).transitions for one in (mapped, without)]
         assert min(rows) > 600
         assert sum(rows) == proposal.transitions
