@@ -48,7 +48,7 @@ JOBS = {
     "coverage": {
         "gaps": "what is missing, and which missions would fill it?",
         "drift": "which robot's wheels, lidar or floor have changed?",
-        "diff": "what is different between two stores, versions, panels or runs?",
+        "diff": "what is different between two stores, versions or panels?",
     },
     "profile": {"schema": "what a TOML file may contain, as a JSON Schema for editors"},
     "store": {
