@@ -17,7 +17,7 @@ from restock.arrays import Bools, Ints
 from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 
 Cells = Bools  # (X, Y)
-Box = tuple[int, int, int, int]  # columns first to last, rows first to last; lasts are exclusive
+Box = tuple[int, int, int, int]  # first and last column, first and last row; lasts are exclusive
 
 WIDTH_M = (0.7, 2.6)  # of a corridor
 LENGTH_M = 1.8  # minimum length of a corridor: a pallet, and room before and behind it

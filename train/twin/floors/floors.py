@@ -87,7 +87,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
     """Generate the floor of a seed; the same seed and recipe always give the same floor.
 
     Raises:
-        ConfigError: a seed out of range, or a recipe whose floors would be too large.
+        ConfigError: the seed is out of range, or the recipe's floors would be too large.
     """
     if not 0 <= seed <= MAX_SEED:
         raise ConfigError(f"a seed must be 0 to {MAX_SEED}, got {seed}", where="layouts")

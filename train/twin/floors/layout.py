@@ -2,8 +2,8 @@
 
 The floor's frame has its origin in the south-west corner, x east and y north; `map_origin` places
 it in the map that a robot localises in. Floors are generated, read from TOML, or read from an
-occupancy map: see `restock.train.twin.floors.floors`. `default_warehouse()` is the floor that logs
-and twin share.
+occupancy map: see `restock.train.twin.floors.floors`. `default_warehouse()` is the floor of the
+sample logs, and the twin's own.
 """
 
 from __future__ import annotations

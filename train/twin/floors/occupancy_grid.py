@@ -40,8 +40,8 @@ from restock.train.twin.floors.layout import (
 from restock.train.twin.floors.planner import Planner
 
 SPACING_M = 0.5  # side of the squares that keep one place each
-PLACES = 100  # maximum
-SAMPLE = 12  # starts, and goals, between which routes are measured (roughly)
+PLACES = 100  # maximum number of places
+SAMPLE = 12  # number of starts, and of goals, between which routes are measured, roughly
 OFTEN = 0.1  # on a large floor, at least this share of routes has a usual mission's length
 SHORTEST = 0.4  # on a smaller floor, the shortest mission as a share of the longest route
 NEAR_M = 3.0  # if visited places are no farther apart, missions go to other places, too

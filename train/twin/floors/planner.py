@@ -89,7 +89,7 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> F64 | None:
-        """Plan past boxes (see `graph_around`), without a cache; None if there is no way.
+        """Plan past boxes (see `graph_around`), uncached; None if there is no way.
 
         Without boxes the plan is that of `plan`.
         """
@@ -144,7 +144,7 @@ class Planner:
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
     def parts(self) -> Ints:
-        """Return the part (size,) of each cell; within a part, robots can drive back and forth."""
+        """Return each cell's part (size,), within which robots can drive from any cell to any other."""
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:

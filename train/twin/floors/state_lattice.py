@@ -93,7 +93,7 @@ class Window:
 
     @property
     def border(self) -> Bools:
-        """Return the cells (nx, ny) along the window's sides, except sides of the floor itself."""
+        """Return a mask (nx, ny) of cells along the window's sides, except sides of the floor."""
         border = np.ones(self.shape, np.bool_)
         first = np.where(self.low > 0, BORDER_CELLS, 0)
         last = self.shape - np.where(self.high < self.floor, BORDER_CELLS, 0)
@@ -109,7 +109,7 @@ class Window:
     def _inner(self) -> tuple[list[float], list[float]]:
         """Return the minimum and maximum x and y of the window without its border, in metres.
 
-        They are infinite on sides of the floor itself.
+        They are infinite at sides of the floor.
         """
         margin = (BORDER_CELLS + 1) * CELL_M
         low = np.where(self.low == 0, -np.inf, self.low * CELL_M + margin)
@@ -326,7 +326,7 @@ def _fill_unknown(times: F64) -> F64:
 def near_gap(floor: Warehouse, own: F64, x: F64, y: F64, within_m: float) -> F64:
     """Return the distance from points (n, …) of n robots to the nearest rack, wall or `own` box.
 
-    It is negative inside. It is exact only below `within_m`: boxes farther from all points of a
+    It is negative inside. Values below `within_m` are exact: boxes farther from all points of a
     robot are skipped, because a floor made from scans has hundreds. `own` (n, K, 4) are the centres
     and half sizes of boxes on each robot's floor.
     """

@@ -45,7 +45,7 @@ def draw_walks(
 
 
 def _find_crossings(plan: F64, warehouse: Warehouse) -> list[int]:
-    """Return points of the plan inside a crossing, at least 1.5 m from its ends."""
+    """Return the indices of plan points in a crossing, at least 1.5 m from the plan's ends."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     margin = int(1.5 / max(spacing, 1e-6)) + 1
     x, y = plan[margin : len(plan) - margin].T
