@@ -248,7 +248,7 @@ def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
     return unfit
 
 
-def sealed(floors: Iterable[Warehouse]) -> list[str]:
+def report_unreachable(floors: Iterable[Warehouse]) -> list[str]:
     """Return a line per floor with unreachable goals, which its episodes never use."""
     return [
         f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"

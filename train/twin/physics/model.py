@@ -296,7 +296,7 @@ def _settle(robot: RobotModel) -> RobotModel:
     return replace(robot, rest_z_m=float(data.qpos[2]))
 
 
-def driven_actions(
+def drive_actions(
     robot: RobotModel, actions: Sequence[tuple[float, float]], friction: float
 ) -> list[dict[str, float]]:
     """Return the steady speeds (m/s, rad/s) of each action on a floor of this friction."""
@@ -314,7 +314,7 @@ def driven_actions(
     return rows
 
 
-def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
+def describe_model(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
     """Return a robot's values in the twin as rows of name, value and source."""
     lidar = Lidar() if robot is None else robot.lidar
     values: dict[str, Any] = {
@@ -354,7 +354,7 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
     return rows
 
 
-def outlined(body: Body) -> list[tuple[str, Any, str]]:
+def describe_outline(body: Body) -> list[tuple[str, Any, str]]:
     """Return a robot's outline and lidar place as rows of name, value and source."""
     return [
         (f"body.{name}", round(getattr(body, name), 4), "task.body")
@@ -362,7 +362,7 @@ def outlined(body: Body) -> list[tuple[str, Any, str]]:
     ]
 
 
-def outside(model: RobotModel, body: Body) -> list[str]:
+def find_overhangs(model: RobotModel, body: Body) -> list[str]:
     """Return the parts of a robot that are outside its outline, and by how much."""
     places = {"the lidar": (body.lidar_x_m, 0.0)}
     for number, (x, y) in enumerate(model.casters_m):

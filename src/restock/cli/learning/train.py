@@ -235,7 +235,7 @@ def describe_run(prepared: Prepared) -> str:
     """Describe the run, and list settings and conditions that will have no effect, one per line."""
     from restock.train.dqn.config import PLANNER
     from restock.train.twin.floors.floors import open_floors
-    from restock.train.twin.physics.episode import sealed
+    from restock.train.twin.physics.episode import report_unreachable
 
     config, panel, document = prepared.config, prepared.panel, prepared.document
     schedule = config.schedule
@@ -267,7 +267,7 @@ def describe_run(prepared: Prepared) -> str:
         )
     if config.env.twin:
         lines += _not_evaluated(document)
-        lines += sealed(open_floors(config.env.layouts))
+        lines += report_unreachable(open_floors(config.env.layouts))
     return "\n".join(lines)
 
 

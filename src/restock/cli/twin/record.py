@@ -83,7 +83,7 @@ class RecordCommand:
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.floors.planner import planners
         from restock.train.twin.missions import NATURAL
-        from restock.train.twin.physics.episode import refuse_unfit, sealed
+        from restock.train.twin.physics.episode import refuse_unfit, report_unreachable
         from restock.train.twin.physics.perturbation import find_perturbation
         from restock.train.twin.recording.bag_writer import refuse_existing
         from restock.train.twin.recording.fleet import parse_shares
@@ -131,7 +131,7 @@ class RecordCommand:
             return
         if (origin := getattr(policy, "origin", None)) is not None:
             output.say(f"{plan.policy}: {origin.text}")
-        for line in sealed(floors):
+        for line in report_unreachable(floors):
             output.say(line)
         ordered_missions = sum(order.missions or 0 for order in plan.orders())
         counted = plan.missions if isinstance(plan.missions, int) else ordered_missions

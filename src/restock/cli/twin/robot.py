@@ -34,10 +34,10 @@ class RobotCommand:
         from restock.ingest.task.robot import refuse_beyond_steering
         from restock.train.twin.physics.model import (
             TIMESTEP_S,
-            driven_actions,
-            measured,
-            outlined,
-            outside,
+            describe_model,
+            describe_outline,
+            drive_actions,
+            find_overhangs,
             passed_over,
             robot_model,
         )
@@ -47,13 +47,13 @@ class RobotCommand:
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
         blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot simulate
         model = robot_model(profile.robot, profile.task.body)
-        facts = outlined(profile.task.body) + measured(model, profile.robot)
-        beyond = outside(model, profile.task.body)
+        facts = describe_outline(profile.task.body) + describe_model(model, profile.robot)
+        beyond = find_overhangs(model, profile.task.body)
         driven = [
             {"action": name, "friction": FRICTION, **row}
             for name, row in zip(
                 profile.task.action_names,
-                driven_actions(model, profile.task.actions, FRICTION),
+                drive_actions(model, profile.task.actions, FRICTION),
                 strict=True,
             )
         ]
