@@ -1,1 +1,1 @@
-"""The twin as Gymnasium environments."""
+"""The twin as Gymnasium environments, and its scripted drivers."""

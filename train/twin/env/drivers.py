@@ -9,8 +9,8 @@ The operator is privileged: it reads the true places of pallets, people and wet 
 it simulates each action for the next 1.2 s. It scores how near the robot comes to racks, pallets
 and people (assumed to keep walking), and how far it gets along a plan around the pallets. Near
 pallets, and where the robot was stuck, it simulates pairs of actions and chooses by the remaining
-time to the goal in a state lattice, which accounts for the heading that a gap takes. On and before
-slippery floor, all but gentle actions score less. A few percent of the actions are random.
+time to the goal in a state lattice, which accounts for the heading that a gap requires. On and
+before slippery floor, all but gentle actions score less. A few percent of the actions are random.
 """
 
 from __future__ import annotations
@@ -296,7 +296,7 @@ CAREFUL_M = 1.8  # from the robot's centre to a person's
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
 STILL_S = 1.0  # a robot that has not moved for longer is stuck
-PATIENCE_S = 4.0  # the same with somebody in the way: then it moves about, to be let past
+PATIENCE_S = 4.0  # the same with somebody near: then it moves about, so that they let it pass
 # Changes of position (m) and heading (rad) that count as movement, for robots that move by at least
 # MOVED_STEP in a control period; less for slower ones.
 MOVED = np.array([0.1, 0.2])

@@ -15,7 +15,7 @@ against them. They are the physical truth over [t, t + 1), with the names of the
 
 Exposures are the situation at t, whatever the outcome:
 
-- closing_traffic: someone within 2 m of the body came nearer, by .1 m/s, in the previous step;
+- closing_traffic: someone within 2 m of the body came nearer, above .1 m/s, in the previous step;
 - plan_blocked: pallets lay on the plan within 2.2 m of the robot's middle;
 - slippery_floor: a wheel stood on a slippery patch.
 

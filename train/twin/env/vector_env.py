@@ -179,8 +179,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
 
         A `perturbation` applies to every episode whose spec has none of its own. A schedule draws
-        one for each such episode (fixed episodes get its base), which is then in `env.specs`. Both
-        may be the name of a built-in perturbation, a TOML file, or a table.
+        one for each such episode (fixed episodes get its base), which is then in `env.specs`. It
+        may also be the name of a built-in perturbation, a TOML file, or a table.
 
         `robot` is a profile's, with the task's outline; None is the twin's own.
 

@@ -144,7 +144,7 @@ class Planner:
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
     def parts(self) -> Ints:
-        """Return each cell's part (size,), within which robots can drive from any cell to any other."""
+        """Return the part (size,) of each cell; robots can drive both ways within a part."""
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:

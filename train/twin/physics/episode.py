@@ -164,8 +164,8 @@ AISLE_ROOM_M = 0.1  # minimum room beside a robot in an aisle: one cell of the p
 def describe_floor(floor: Warehouse) -> dict[str, Any]:
     """Return sizes in metres, counts, unreachable goals, and the kinds of episodes that fit.
 
-    A goal is unreachable if no robot gets there from the largest part of the floor under its
-    one-way rules. `hash` identifies the floor independently of its name.
+    A goal is unreachable if one-way rules and racks leave no way to and from the part of the floor
+    with most goals. `hash` identifies the floor independently of its name.
     """
     widths = [segment.width_m for segment in floor.segments]
     return {

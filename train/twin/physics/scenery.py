@@ -66,7 +66,7 @@ class Traffic(Stateful):
         self.body_half_m = np.array(body_half_m)
         self.radius_m = np.array([PERSON_RADIUS_M] * PEOPLE + [FORKLIFT_RADIUS_M] * FORKLIFTS)
         circle_m = [PERSON_RADIUS_M] * PEOPLE + [float(np.hypot(*_TRUCK_HALF_M))] * FORKLIFTS
-        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # centres farther apart: a gap
+        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # centres beyond it: no touch
         # Smallest gap to the robot's outline in the episode so far: inf if nobody is there, NaN if
         # it is not measured, because measuring takes time.
         self.closest_m = np.full(num_envs, np.nan)

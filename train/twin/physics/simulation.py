@@ -501,7 +501,7 @@ class Simulation(Stateful):
             self.qpos[:, self._steering_qpos] = angles
 
     def _slipping(self, ids: Ints, heading: F64, slippery: Bools) -> Bools:
-        """Return robots (n,) with a wheel on a patch (n, W) that slides faster than the limit."""
+        """Return the robots (n,) with a wheel on a patch (n, W) that slides beyond the limit."""
         velocity = self.qvel[ids]
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]

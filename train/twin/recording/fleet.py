@@ -98,8 +98,8 @@ def schedule(
 class OrderedMissions:
     """The missions of a file, in rounds until the ordered number of missions has met its kind.
 
-    A mission with pallets in an aisle may never pass them. So each round drives the missions that
-    are still owed, shuffled; all rounds together drive at most MAX_DRIVEN times the ordered number.
+    A mission with pallets in an aisle may never get near them. So each round drives the missions
+    still owed, shuffled; all rounds together drive at most MAX_DRIVEN times the ordered number.
     """
 
     def __init__(

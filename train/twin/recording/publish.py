@@ -149,7 +149,7 @@ class Robot:
         for start_s, until_s, (_, points) in zip(
             starts, [*starts[1:], end_s], drive.plans, strict=True
         ):
-            # Exclude `until_s`, when the next plan is sent, even if a time is off by a last bit.
+            # Exclude `until_s`, when the next plan is sent, even if rounding moves a time past it.
             until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
             times = np.arange(start_s, until_s, 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]

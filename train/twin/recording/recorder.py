@@ -90,7 +90,7 @@ class RecordingPlan:
 
     format: Format = "mcap"
     minutes: float | None = None
-    missions: int | MissionsFile | None = None  # a file's are driven until they met their kinds
+    missions: int | MissionsFile | None = None  # a file's: until they have met their kinds
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
     policy: str = HANDOVER  # or planner, operator, random, or the policy given to `record`
