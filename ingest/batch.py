@@ -200,10 +200,7 @@ def _prepare_serially(
 def _prepare_in_workers(
     job: IngestJob, paths: Sequence[Path], workers: int, group: CommitGroup
 ) -> Generator[tuple[int, Prepared | RestockError] | None]:
-    """Prepare the recordings in several processes.
-
-    If a process dies, each recording of its bundle is read again in a bundle of its own.
-    """
+    """Prepare recordings in several processes; if one dies, read its recordings again singly."""
 
     def died(bundle: Sequence[Path], code: int) -> list[Prepared | RestockError]:
         return [_died_error(path, code) for path in bundle if len(bundle) == 1]

@@ -492,10 +492,7 @@ def _removal(store: StoreWriter, recording_id: str) -> str:
 def _commit(
     store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
 ) -> dict[int, IngestResult | StoreError | RecordingError]:
-    """Commit all recordings at once, or if that fails, each alone.
-
-    `begun` tells whether a commit that includes them had begun before.
-    """
+    """Commit all at once or, if that fails, each alone; `begun` if a commit of them had begun."""
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
     if not several:

@@ -95,10 +95,7 @@ class Contents:
 
 
 def survey(file: FileBytes, watch: Watch = no_progress, *, only: Collection[int] = ()) -> Contents:
-    """Walk the file's top-level records, and take in all kinds or `only` some.
-
-    `watch` is called with the progress.
-    """
+    """Walk the top-level records and take in all kinds, or `only` some; report to `watch`."""
     contents = Contents()
     end = len(file)
     finished = False

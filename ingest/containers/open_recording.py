@@ -213,10 +213,7 @@ def is_storage_name(path: Path) -> bool:
 
 
 def is_bag(folder: Path) -> bool:
-    """Return whether a folder is one rosbag2 bag.
-
-    It has a metadata.yaml, or its storage files are all named after it.
-    """
+    """Return whether a folder is a bag: it has metadata.yaml, or only storage files of its name."""
     if (folder / METADATA).is_file():
         return True
     files = [item for item in folder.iterdir() if item.is_file() and is_storage_name(item)]

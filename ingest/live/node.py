@@ -336,8 +336,7 @@ class PolicyNode:
     def _match_latched(self) -> None:
         """Subscribe to a topic's last message while a publisher latches it.
 
-        A publisher that does not latch would send nothing to such a subscription, and both would
-        log a warning.
+        To such a subscription, other publishers would send nothing, and both sides would warn.
         """
         keeps = self.ros.DurabilityPolicy.TRANSIENT_LOCAL
         for topic, kind in self._latching.items():

@@ -26,17 +26,14 @@ def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Kind:
-    """A message type that may fill an input, and its fields.
-
-    `words`, `never` and `rather` are words in a topic's name.
-    """
+    """A message type that may fill an input, and its fields."""
 
     type: str
     fields: dict[str, str]
-    words: tuple[str, ...] = ()  # prefer a topic, by the first that it has
+    words: tuple[str, ...] = ()  # words in a topic's name that favour it, best first
     must: bool = False  # require one of `words`
-    never: tuple[str, ...] = ()  # exclude a topic
-    rather: tuple[str, ...] = ()  # put a topic after all others
+    never: tuple[str, ...] = ()  # words in a topic's name that exclude it
+    rather: tuple[str, ...] = ()  # words in a topic's name that put it last
     at_changes: bool = False  # messages come when something changes, and hold until then
 
     @property
