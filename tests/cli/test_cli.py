@@ -1,4 +1,4 @@
-"""The front door: help that teaches, one clear message for what is wrong, the right exit code."""
+"""The command line: help, error messages and exit codes."""
 
 import os
 import re
@@ -23,28 +23,28 @@ def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_verb_explains_itself(command: str, shell: Shell) -> None:
+def test_every_verb_has_help(command: str, shell: Shell) -> None:
     out = shell.out(*command.split(), "--help")
     assert f"restock {command}" in out
     assert len(out.split()) > 40
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_verb_is_in_the_docs(command: str) -> None:
+def test_every_verb_is_documented(command: str) -> None:
     pages = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs").glob("*.md"))
     assert f"restock {command}" in pages
 
 
 @pytest.mark.parametrize("verb", RENAMED)
-def test_an_old_verb_is_answered_with_the_new_one(verb, shell):
-    said = shell.err(verb, "store")
-    assert RENAMED[verb] in said
-    named = re.findall(r"`restock (\w+)(?: (\w+))?", said)
+def test_renamed_verb_suggests_new_name(verb, shell):
+    err = shell.err(verb, "store")
+    assert RENAMED[verb] in err
+    named = re.findall(r"`restock (\w+)(?: (\w+))?", err)
     assert all(new in cli.VERBS and verb != new for new, _ in named)
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_removed_option_is_answered_with_the_new_way(option, shell):
+def test_removed_option_suggests_replacement(option, shell):
     command = option.rpartition(" ")[0] or "sql"
     assert OPTIONS[option] in shell.err(
         *command.split(), "place", f"--{option.partition('--')[2]}=1"
@@ -52,20 +52,20 @@ def test_removed_option_is_answered_with_the_new_way(option, shell):
 
 
 @pytest.mark.parametrize("words", [["store"], ["store", "none"], ["twin", "none"]], ids=" ".join)
-def test_a_job_must_be_named(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_job_lists_jobs(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == ExitCode.USAGE
     printed = "".join(capsys.readouterr())
     assert all(job in printed for job in cli.JOBS[words[0]])
 
 
-def test_an_unknown_verb_suggests_the_near_one(shell: Shell) -> None:
+def test_unknown_verb_suggests_nearest(shell: Shell) -> None:
     out, err = shell.printed("inget", code=2)
     assert out == ""
     assert "no verb named 'inget'" in err
     assert "restock ingest" in err
 
 
-def test_the_version_is_printed() -> None:
+def test_version_is_printed() -> None:
     done = restock("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("restock 0.")
@@ -84,14 +84,14 @@ sys.exit(cli.main([]))
 
 @pytest.mark.parametrize("python", [["-m", "restock", "info", "--help"], ["-c", PRINTS]])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str) -> None:
+def test_closed_pipe_is_not_an_error(python: list[str], unbuffered: str) -> None:
     read_end, write_end = os.pipe()
     os.close(read_end)
-    with os.fdopen(write_end, "wb") as gone:
+    with os.fdopen(write_end, "wb") as closed:
         done = subprocess.run(
             [sys.executable, *python],
             env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
-            stdout=gone,
+            stdout=closed,
             stderr=subprocess.PIPE,
             text=True,
         )
@@ -99,7 +99,7 @@ def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str)
     assert done.returncode == 0
 
 
-def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(store_path, monkeypatch, shell):
+def test_many_rows_are_cut_only_on_terminal(store_path, monkeypatch, shell):
     store = str(store_path)
     columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
     query = f"SELECT {columns} FROM range(100) AS t(i)"
@@ -113,13 +113,13 @@ def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(store_path, monkeyp
     assert [line.split()[0] for line in lines] == ["row", "number", "numbers", "text"] * 2
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    shown, said = shell.printed("sql", store, query)
-    assert [line.split()[0] for line in shown.splitlines()[2:]] == [str(n) for n in range(40)]
-    assert "100 rows, 40 shown" in said
+    out, err = shell.printed("sql", store, query)
+    assert [line.split()[0] for line in out.splitlines()[2:]] == [str(n) for n in range(40)]
+    assert "100 rows, 40 shown" in err
     assert "… 30 in all" in shell.out("sql", store, f"FROM ({query}) LIMIT 1 \\G")
 
 
-def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, shell):
+def test_terminal_omits_middle_columns(store_path, monkeypatch, shell):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "40")
     named = ", ".join(f"{number} AS c_{number}" for number in range(1, 20))
@@ -147,7 +147,7 @@ def test_a_terminal_leaves_out_columns_in_the_middle(store_path, monkeypatch, sh
     ],
     ids=" ".join,
 )
-def test_an_option_that_would_do_nothing_is_refused(words, shell):
+def test_option_without_effect_is_refused(words, shell):
     *_, last = (word for word in words if word.startswith("--"))
     assert last in shell.err(*words)
 
@@ -162,15 +162,15 @@ def test_an_option_that_would_do_nothing_is_refused(words, shell):
     ],
     ids=" ".join,
 )
-def test_an_empty_path_is_not_the_working_directory(words, tmp_path, monkeypatch, shell):
+def test_empty_path_is_refused(words, tmp_path, monkeypatch, shell):
     monkeypatch.chdir(tmp_path)
     assert "variable of the shell not set" in shell.err(*words)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("more", ["info", "ingest --store s", "sql FROM", "mix --out p"])
-def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(more, shell):
+def test_credentials_in_address_are_masked(more, shell):
     verb, *words = more.split()
-    said = "".join(shell.printed(verb, "s3://AKIA:hu/sh@bucket/logs", *words, code=2))
-    assert "***:***@bucket/logs" in said
-    assert "hu/sh" not in said
+    printed = "".join(shell.printed(verb, "s3://AKIA:hu/sh@bucket/logs", *words, code=2))
+    assert "***:***@bucket/logs" in printed
+    assert "hu/sh" not in printed

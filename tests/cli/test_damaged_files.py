@@ -1,4 +1,4 @@
-"""Missing, cut or changed files: every verb names the path, a remedy, and exits 2, never 1."""
+"""Missing, cut or changed files: every verb names the path and a remedy, and exits 2, never 1."""
 
 import json
 import os
@@ -35,8 +35,8 @@ FILES = (
 
 
 @pytest.fixture(autouse=True)
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no charts of what was read: they are most of a page's time."""
+def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skip charts, which take most of the time of a page."""
     monkeypatch.setattr("restock.report.look.charts._svg", lambda spec: "<svg/>")
 
 
@@ -52,7 +52,7 @@ def damage(path: Path, how: str) -> None:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a store, a panel of it and a run on that, each as small as it can be."""
+    """Return a folder with a small store, a panel of it and a run on the panel."""
     root = tmp_path_factory.mktemp("whole")
     task = load_profile("warehouse_amr").task
     rows = [recording_transitions(number, episodes=6, task=task) for number in (1, 2)]
@@ -76,7 +76,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
-    """Return a command line a verb that reads a run."""
+    """Return one command line per verb that reads a run."""
     path = str(run)
     return {
         "eval": ["eval", path, "--dry-run", "--policies", "agent"],
@@ -92,15 +92,15 @@ def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
 
 
 def check(argv: list[str], named: Path, capsys: pytest.CaptureFixture[str]) -> int:
-    """Run a command: 0, 1 for a refused comparison, or 2 with the place in what it says."""
+    """Run a command; check that it exits 0, 1 for a refused comparison, or 2 and names the path."""
     code = cli.main(argv)
-    said = capsys.readouterr().err
-    assert "Traceback" not in said, argv
-    assert "an unexpected" not in said, (argv, said)
+    err = capsys.readouterr().err
+    assert "Traceback" not in err, argv
+    assert "an unexpected" not in err, (argv, err)
     if code:
-        assert code == 2 or (code == 1 and argv[0] == "compare"), (argv, code, said)
+        assert code == 2 or (code == 1 and argv[0] == "compare"), (argv, code, err)
     if code == 2:
-        assert str(named) in said, (argv, said)
+        assert str(named) in err, (argv, err)
     return code
 
 
@@ -108,7 +108,7 @@ def check(argv: list[str], named: Path, capsys: pytest.CaptureFixture[str]) -> i
     ("name", "turn"),
     one_in(6 * len(DAMAGES) + 1, [(name, turn) for name in FILES for turn in range(len(DAMAGES))]),
 )
-def test_a_damaged_run_is_said_by_every_verb(name, turn, root, tmp_path, capsys):
+def test_every_verb_reports_damaged_run(name, turn, root, tmp_path, capsys):
     whole = run_verbs(root / "run", root, tmp_path)
     for number, verb in enumerate(whole):
         if number % len(DAMAGES) != turn:  # every verb meets every file, each damage in turn
@@ -120,7 +120,7 @@ def test_a_damaged_run_is_said_by_every_verb(name, turn, root, tmp_path, capsys)
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-def test_what_a_verb_needs_is_named_by_its_file(how, root, tmp_path, capsys):
+def test_damaged_required_file_is_named(how, root, tmp_path, capsys):
     needed = {
         "report": "strata.parquet",
         "train": "checkpoints/latest.safetensors",
@@ -142,7 +142,7 @@ def test_what_a_verb_needs_is_named_by_its_file(how, root, tmp_path, capsys):
     ("key", "value", "before"),
     [("optimizer.learning_rate", 0.5, "0.001"), ("network.hidden", [9], "[8]"), ("seed", 3, "0")],
 )
-def test_a_config_that_was_edited_is_not_resumed(key, value, before, root, tmp_path, shell):
+def test_edited_config_is_not_resumed(key, value, before, root, tmp_path, shell):
     run = Path(shutil.copytree(root / "run", tmp_path / "run"))
     document = json.loads((run / "config.json").read_text())
     config, (*tables, name) = document["config"], key.split(".")
@@ -151,8 +151,8 @@ def test_a_config_that_was_edited_is_not_resumed(key, value, before, root, tmp_p
         config = config[table]
     config[name] = value
     (run / "config.json").write_text(json.dumps(document))
-    said = shell.err(*run_verbs(run, root, tmp_path)["train"])
-    assert f"{run}/config.json: {key} is {value}, but the run was trained with {before}" in said
+    err = shell.err(*run_verbs(run, root, tmp_path)["train"])
+    assert f"{run}/config.json: {key} is {value}, but the run was trained with {before}" in err
 
 
 def store_verbs(store: Path, out: Path) -> list[list[str]]:
@@ -170,11 +170,11 @@ def store_verbs(store: Path, out: Path) -> list[list[str]]:
 
 @pytest.mark.parametrize("table", ["recordings", "transitions"])
 @pytest.mark.parametrize("how", [*DAMAGES, "a page"])
-def test_a_store_with_a_damaged_file_is_said(table, how, root, tmp_path, capsys):
+def test_damaged_store_file_is_reported(table, how, root, tmp_path, capsys):
     store = tmp_path / "store"
     shutil.copytree(root / "store", store)
     file = sorted((store / table).glob("*.parquet"))[0]
-    if how == "a page":  # the footer is whole: seen only once it is read
+    if how == "a page":  # the footer is intact, so only reading finds it
         content = file.read_bytes()
         file.write_bytes(content[:8] + bytes(byte ^ 0x55 for byte in content[8:40]) + content[40:])
     else:
@@ -186,7 +186,7 @@ def test_a_store_with_a_damaged_file_is_said(table, how, root, tmp_path, capsys)
 
 
 @pytest.mark.parametrize("task", ["a key", "{", ""])
-def test_a_task_of_another_restock_is_said(task, root, tmp_path, shell):
+def test_task_of_newer_version_is_reported(task, root, tmp_path, shell):
     store = tmp_path / "store"
     shutil.copytree(root / "store", store)
     for file in (store / "recordings").glob("*.parquet"):
@@ -197,9 +197,9 @@ def test_a_task_of_another_restock_is_said(task, root, tmp_path, shell):
             row["task_json"] = newer if task == "a key" else task
         pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), file)
     for argv in store_verbs(store, tmp_path):
-        said = shell.err(*argv)
-        assert f"{store}: the task in its recordings' manifests cannot be read" in said
-        assert "newer Restock" in said
+        err = shell.err(*argv)
+        assert f"{store}: the task in its recordings' manifests cannot be read" in err
+        assert "newer Restock" in err
 
 
 def writers(root: Path, out: Path) -> list[list[str]]:
@@ -214,7 +214,7 @@ def writers(root: Path, out: Path) -> list[list[str]]:
     ]
 
 
-def test_a_target_that_cannot_be_written_is_said(root, tmp_path, capsys):
+def test_unwritable_target_is_reported(root, tmp_path, capsys):
     (tmp_path / "file").write_text("a file, where a folder is asked for")
     for argv in [*writers(root, tmp_path / "file"), ["train", "--out", str(tmp_path / "file/run")]]:
         assert check(argv, tmp_path / "file", capsys) == 2
@@ -224,9 +224,7 @@ def test_a_target_that_cannot_be_written_is_said(root, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("limit", "remedy"), [("0GB", 'write it like "4GB"'), ("1MB", "RESTOCK_MEMORY_LIMIT")]
 )
-def test_a_memory_limit_that_is_too_small_is_said(
-    limit, remedy, root, tmp_path, monkeypatch, shell
-):
+def test_too_small_memory_limit_is_reported(limit, remedy, root, tmp_path, monkeypatch, shell):
     store = str(root / "store")
     monkeypatch.setenv("RESTOCK_MEMORY_LIMIT", limit)
     for argv in (
@@ -236,27 +234,27 @@ def test_a_memory_limit_that_is_too_small_is_said(
         ["audit", store, "--capacity"],
         ["audit", store, "--reward"],
     ):
-        said = shell.err(*argv)
-        assert "memory limit" in said, argv
-        assert remedy in said.splitlines()[-1], argv
-        assert "damaged" not in said, argv
+        err = shell.err(*argv)
+        assert "memory limit" in err, argv
+        assert remedy in err.splitlines()[-1], argv
+        assert "damaged" not in err, argv
 
 
-def test_a_path_that_is_not_utf_8_is_no_bug(tmp_path, shell):
+def test_non_utf8_path_is_reported(tmp_path, shell):
     place = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")
-    said = " ".join(shell.err("audit", place).split())
-    assert "a path is not UTF-8, as it must be for a store, a panel or a run" in said
-    assert r"/caf\xe9/transitions rename the folder" in said
+    err = " ".join(shell.err("audit", place).split())
+    assert "a path is not UTF-8, as it must be for a store, a panel or a run" in err
+    assert r"/caf\xe9/transitions rename the folder" in err
 
 
-def test_what_nobody_foresaw_exits_2_and_developers_see_where(monkeypatch, shell):
+def test_unexpected_error_exits_2_traceback_on_request(monkeypatch, shell):
     def broken(args: list[str]) -> int:
         return {}["a key"]  # type: ignore[no-any-return]
 
     monkeypatch.setattr(cli, "_dispatch", broken)
-    said = shell.err("info", "a.mcap")
-    assert "restock info a.mcap: an unexpected KeyError: 'a key'" in said
-    assert "RESTOCK_TRACEBACK=1" in said
-    assert "Traceback" not in said
+    err = shell.err("info", "a.mcap")
+    assert "restock info a.mcap: an unexpected KeyError: 'a key'" in err
+    assert "RESTOCK_TRACEBACK=1" in err
+    assert "Traceback" not in err
     monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
     assert "Traceback" in shell.err("info", "a.mcap")

@@ -23,7 +23,7 @@ def plan(tmp_path: Path) -> list[Stage]:
     return plan_of(Settings((str(tmp_path / "logs"),), tmp_path / "out", seconds=5, episodes=1))
 
 
-def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
+def test_every_stage_is_valid_command(tmp_path: Path) -> None:
     verbs = [stage.command[0] for stage in plan(tmp_path)]
     before = ["info", "ingest", "sql", "audit", "mix", "mix"]
     assert verbs == [*before, "train", "train", "train", "eval", "eval", "report"]
@@ -33,13 +33,13 @@ def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
         assert not stage.beside or cli.main([*stage.beside, "--help"]) == 0
 
 
-def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
+def test_compared_trainings_differ_only_in_panel(tmp_path: Path) -> None:
     settings = ("practice.rule=success", "seed=3")
     to = Settings(("logs",), tmp_path, seconds=9, train=settings)
     (stage,) = [stage for stage in plan_of(to) if stage.beside]
-    reported = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
+    options = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
     first, second = (
-        {flag: value for flag, value in one.items() if flag.startswith("--")} for one in reported
+        {flag: value for flag, value in one.items() if flag.startswith("--")} for one in options
     )
     assert first.keys() == second.keys()
     differing = {flag for flag in first if first[flag] != second[flag]}
@@ -47,7 +47,7 @@ def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
     assert {"practice.rule=success", "seed=3"} <= {*stage.command} & {*stage.beside}
 
 
-def test_the_run_that_is_behind_catches_up(tmp_path: Path) -> None:
+def test_run_that_is_behind_catches_up(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path, seconds=9)
     other = demo.fed_uniformly(to)
 
@@ -74,7 +74,7 @@ def verb(command: list[str], code: int = 0) -> int:
     return code
 
 
-def test_what_runs_beside_a_stage_fails_it(tmp_path: Path) -> None:
+def test_failure_of_parallel_command_fails_stage(tmp_path: Path) -> None:
     def stage(*beside: str) -> Stage:
         return Stage("x", "x", ["info"], beside=beside, writes=())
 
@@ -83,12 +83,12 @@ def test_what_runs_beside_a_stage_fails_it(tmp_path: Path) -> None:
     ended = Work(tmp_path / "b", verb, SILENT).do(missing)
     assert (ended.status, ended.exit_code) == ("failed", 2)
     assert "nothing" in "".join(ended.errors)
-    # What is beside one that fails does not go on.
+    # If the stage's command fails, the parallel one is stopped.
     failing = Work(tmp_path / "c", lambda command: verb(command, 2), SILENT).do(missing)
     assert failing.exit_code == 2
 
 
-def test_an_unexpected_exit_code_stops_the_demo(tmp_path, monkeypatch):
+def test_unexpected_exit_code_stops_demo(tmp_path, monkeypatch):
     ran: list[str] = []
 
     def dispatch(command: list[str]) -> int:
@@ -104,7 +104,7 @@ def test_an_unexpected_exit_code_stops_the_demo(tmp_path, monkeypatch):
     assert ran[-1] == "mix"
 
 
-def test_a_stage_decides_its_command_when_its_turn_comes(tmp_path: Path) -> None:
+def test_stage_command_is_decided_when_stage_begins(tmp_path: Path) -> None:
     ran: list[list[str]] = []
 
     def dispatch(command: list[str]) -> int:
@@ -121,7 +121,7 @@ def test_a_stage_decides_its_command_when_its_turn_comes(tmp_path: Path) -> None
     assert len(ran) == 1
 
 
-def test_a_demo_that_cannot_begin_writes_nothing(tmp_path: Path) -> None:
+def test_demo_refuses_foreign_folder(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     assert cli.main(["demo", "--out", str(tmp_path)]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

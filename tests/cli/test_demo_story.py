@@ -1,4 +1,4 @@
-"""What the demo tells at its end, of a store, a panel and runs as its stages leave them."""
+"""The summary at the end of the demo, from a store, a panel and runs as its stages leave them."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ STEPS = ROOT / "benchmarks" / "evidence" / "step-quotas.toml"
 
 
 @pytest.fixture(scope="module")
-def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
+def finished_stages(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     to = Settings((str(LOGS),), tmp_path_factory.mktemp("demo"))
     for command in (
         ["ingest", str(LOGS), "--store", str(to.store)],
@@ -31,7 +31,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def driven(policy: str, condition: str, success: float | None) -> dict[str, Any]:
+def result_row(policy: str, condition: str, success: float | None) -> dict[str, Any]:
     ends = dict.fromkeys(("success_low", "success_high"))
     return {
         "policy": policy,
@@ -41,13 +41,13 @@ def driven(policy: str, condition: str, success: float | None) -> dict[str, Any]
     } | ends
 
 
-def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys):
-    """The plan of the panel was printed, as if it had been drawn."""
-    demo.tell(reported, {"results": [driven("agent", "nominal", 1.0)]}, stdout())
+def test_strata_are_shown_by_drawn_rows(finished_stages, capsys):
+    """Regression: the panel's plan was printed as if it had been drawn."""
+    demo.tell(finished_stages, {"results": [result_row("agent", "nominal", 1.0)]}, stdout())
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    drawn_rows = Run.open(reported.run).table("strata").to_pylist()
+    drawn_rows = Run.open(finished_stages.run).table("strata").to_pylist()
     whole = sum(row["drawn_rows"] for row in drawn_rows)
-    for stratum in Panel.open(reported.panel).strata:
+    for stratum in Panel.open(finished_stages.panel).strata:
         (shown,) = [line for line in lines if line[:1] == [stratum.name] and len(line) == 7]
         of_name = [row["drawn_rows"] for row in drawn_rows if row["stratum"] == stratum.name]
         drawn = f"{100 * sum(of_name) / whole:.1f}"
@@ -55,8 +55,8 @@ def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported, capsys):
         assert shown[3:6] == [drawn, drawn, "0.0"]  # nothing was driven
 
 
-def test_a_rare_event_is_followed_from_its_message_to_an_update(reported: Settings) -> None:
-    lines = demo.rare_event(reported)
+def test_rare_event_is_traced_from_message_to_update(finished_stages: Settings) -> None:
+    lines = demo.rare_event(finished_stages)
     assert [line.split()[0] for line in lines] == ["recording", "row", "update", "All"]
     assert str(LOGS) in lines[0]
     assert "nominal" not in "".join(lines)
@@ -64,12 +64,12 @@ def test_a_rare_event_is_followed_from_its_message_to_an_update(reported: Settin
     assert cli.main([*command, "--json"]) == 0
 
 
-def test_policies_stand_side_by_side_by_kind_of_mission(tmp_path: Path) -> None:
+def test_policies_are_compared_by_mission_kind(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path)
     alone, uniform = f"run:{demo.logs_alone(to)}", f"run:{demo.fed_uniformly(to)}"
-    rows = [driven(policy, "wheel_slip", 0.5) for policy in (alone, uniform, "agent", "random")]
-    other = driven("agent", "wheel_slip", 0.0) | {"perturbation": "friction"}
-    rows += [driven("planner", kind, 1.0) for kind in ("nominal", "wheel_slip")]
+    rows = [result_row(policy, "wheel_slip", 0.5) for policy in (alone, uniform, "agent", "random")]
+    other = result_row("agent", "wheel_slip", 0.0) | {"perturbation": "friction"}
+    rows += [result_row("planner", kind, 1.0) for kind in ("nominal", "wheel_slip")]
     slip, easy = demo.before_and_after({"results": [*rows, other]})
     success = {"logs alone": "0.50", "fed uniformly": "0.50", "agent": "0.50", "planner": "1.00"}
     assert slip == {"mission": "wheel_slip"} | success

@@ -1,4 +1,4 @@
-"""`restock coverage drift`: names what changed, as text, JSON and a page."""
+"""`restock coverage drift`: changes are reported as text, JSON and a page."""
 
 from pathlib import Path
 
@@ -19,14 +19,14 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fleet_store(tmp_path_factory.mktemp("fleet") / "store", robots, recordings=3)
 
 
-def test_it_names_the_worn_wheel(store: Path, shell: Shell) -> None:
+def test_drift_verb_reports_worn_wheel(store: Path, shell: Shell) -> None:
     out = shell.out("coverage", "drift", store)
     assert "amr-2: wheels: odometry_scale 0.9" in out
     assert "since 2026-03-16 (2 of 2 weeks)" in out
     assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 1
 
 
-def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, shell):
+def test_page_matches_json_and_escapes_names(store, tmp_path, shell):
     page = tmp_path / "pages" / "coverage.html"
     document = shell.json("coverage", "drift", store)
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
@@ -38,7 +38,7 @@ def test_the_page_says_the_same_and_trusts_no_name(store, tmp_path, shell):
     assert HOSTILE in read.text
 
 
-def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, shell):
+def test_untestable_fleet_is_reported(tmp_path, shell):
     store = fleet_store(tmp_path / "store", [SyntheticRobot(None)], weeks=1, episodes=2)
     page = tmp_path / "coverage.html"
     assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
@@ -46,19 +46,23 @@ def test_a_fleet_with_nothing_to_compare_says_so(tmp_path, shell):
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
-    said = "Nothing could be tested: every robot drove in one week only, so none has a reference."
+    message = (
+        "Nothing could be tested: every robot drove in one week only, so none has a reference."
+    )
     for text in (page.read_text("utf-8"), out):
-        assert said in text
+        assert message in text
         assert "at least 5 episodes in each" in text
         assert "no change that matters" not in text.lower()
 
 
-def test_no_change_is_said_with_its_number_of_tests(tmp_path, shell):
+def test_no_change_is_reported_with_number_of_tests(tmp_path, shell):
     store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
     document = shell.json("coverage", "drift", store)
     own = [row for row in document["tests"] if row["against"] == "own reference"]
     tests = sum(row["p"] is not None for row in own)
     assert document["findings"] == []
     assert document["tested"] == tests > 0
-    said = f"No change that matters was found in {tests} tests against the robots' own references"
-    assert said in shell.out("coverage", "drift", store)
+    message = (
+        f"No change that matters was found in {tests} tests against the robots' own references"
+    )
+    assert message in shell.out("coverage", "drift", store)

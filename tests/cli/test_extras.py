@@ -1,4 +1,4 @@
-"""A lean installation: what works without the extras, and what it says of a missing one."""
+"""A lean installation: which verbs work without extras, and errors about missing ones."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from support.paths import ROOT
 
 from restock.process import EXTRAS, install_command
 
-# Runs command lines of restock in a process to which the optional packages are absent.
+# Runs restock command lines in a process that lacks the optional packages.
 LEAN = """
 import io, json, shlex, sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -86,28 +86,28 @@ def ended(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
     assert done.returncode == 0, done.stderr[-2000:]
     made = {"sample_logs", "run", "panel", "a.parquet", "set"}
-    assert {path.name for path in folder.iterdir()} == made  # by those that work
-    said = done.stdout.splitlines()[-1]  # with -c, DuckDB prints how far a slow query is before it
-    return dict(zip(lines, map(tuple, json.loads(said)), strict=True))
+    assert {path.name for path in folder.iterdir()} == made  # written by the verbs that work
+    last = done.stdout.splitlines()[-1]  # with -c, DuckDB prints the progress of slow queries first
+    return dict(zip(lines, map(tuple, json.loads(last)), strict=True))
 
 
 @pytest.mark.parametrize("line", WORKS)
-def test_a_lean_installation_does_without_the_extras(line, ended) -> None:
+def test_verb_works_without_extras(line, ended) -> None:
     code, errors = ended[line]
     assert code in (0, 1), errors
 
 
 @pytest.mark.parametrize(("line", "extra"), NEEDS.items())
-def test_a_missing_extra_is_one_sentence_with_its_command(line, extra, ended) -> None:
+def test_missing_extra_names_install_command(line, extra, ended) -> None:
     code, errors = ended[line]
     assert code == 2
-    says, remedy = (text.strip() for text in errors.strip().splitlines()[-2:])
-    assert says.endswith(", which is not installed")
+    problem, remedy = (text.strip() for text in errors.strip().splitlines()[-2:])
+    assert problem.endswith(", which is not installed")
     assert remedy == install_command(extra)
     assert "bug" not in errors
 
 
-def test_every_optional_package_names_an_extra_that_has_it() -> None:
+def test_optional_packages_are_in_their_extra() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     there = packages_distributions()

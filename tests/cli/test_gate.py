@@ -1,4 +1,4 @@
-"""`restock audit`: a store and a run that may go on, and those that may not."""
+"""`restock audit` as a gate: stores and runs that pass, and those that do not."""
 
 import json
 from pathlib import Path
@@ -14,19 +14,19 @@ from restock.train.run.run import Run, kept_policy
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """`both` has two drives, `one` the first of them alone."""
+    """Return stores `both`, of two drives, and `one`, of the first alone."""
     folder, drives = tmp_path_factory.mktemp("check"), [recording_transitions(n) for n in (1, 2)]
     found = {"both": drives, "one": drives[:1]}
     return {name: write_store(folder / name, some) for name, some in found.items()}
 
 
 def check(shell: Shell, *words: object) -> dict[str, str]:
-    """Return each check's status, of which some fail."""
+    """Return the status of each check; at least one fails."""
     checks = shell.json("audit", *words, code=1)["audits"]
     return {f"{one['part']}.{one['audit']}": one["status"] for one in checks}
 
 
-def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, shell):
+def test_lost_recordings_fail(stores, tmp_path, shell):
     junit = tmp_path / "check.xml"
     found = check(shell, stores["one"], "--against", stores["both"], "--junit", junit)
     assert found["diff.recordings_lost"] == "fail"
@@ -43,7 +43,7 @@ def test_what_was_lost_since_the_last_store_fails(stores, tmp_path, shell):
     assert "fail" not in {status for name, status in found.items() if name.startswith("diff")}
 
 
-def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path, shell):
+def test_missing_baseline_fails_and_wrong_usage_is_refused(stores, tmp_path, shell):
     found = check(shell, stores["one"], "--against", tmp_path / "gone")
     assert found["diff.comparable"] == "fail"
     assert "no such store" in shell.err("audit", tmp_path / "gone")
@@ -56,8 +56,8 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(stores, tmp_path,
 @pytest.mark.parametrize(
     ("verb", "option"), [("audit", "--junit"), *(("coverage", "--out"), ("report", "--out"))]
 )
-def test_a_folder_as_output_file_is_refused_early(verb, option, tmp_path, shell):
-    """Before it is even looked whether there is a store."""
+def test_folder_as_output_file_is_refused_early(verb, option, tmp_path, shell):
+    """The check comes before the store is looked for."""
     error = shell.err(*verb.split(), tmp_path / "gone", option, tmp_path)
     assert error.startswith(f"restock: {option}: {tmp_path} is a folder")
     assert ".tmp" not in error
@@ -76,7 +76,7 @@ def gated(run: Path, verdict: str = "not worse", **changes: object) -> None:
     (run / "gate" / "gate.json").write_text(json.dumps(document | changes))
 
 
-def test_a_run_must_have_passed_its_gate_against_the_baseline(stores, tmp_path, shell):
+def test_run_must_have_passed_gate_against_baseline(stores, tmp_path, shell):
     run = kept_run(tmp_path / "run")
 
     def statuses() -> dict[str, str]:

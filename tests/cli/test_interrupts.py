@@ -1,4 +1,4 @@
-"""A kill is an interrupt, and what waits for a process in a thread can be interrupted too."""
+"""SIGTERM interrupts as Ctrl-C does, also threads that wait for a process."""
 
 import os
 import signal
@@ -30,30 +30,30 @@ WAITS = [sys.executable, "-c", "import time; print(flush=True); time.sleep(600)"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_kill_does_what_ctrl_c_does_at_that_moment(number: int) -> None:
-    requested: list[int] = []
+def test_kill_acts_like_ctrl_c(number: int) -> None:
+    handled: list[int] = []
     usual = signal.signal(number, signal.SIG_DFL)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with kill_as_interrupt():
             with pytest.raises(KeyboardInterrupt):
                 os.kill(os.getpid(), number)
-            signal.signal(signal.SIGINT, lambda *_: requested.append(1))
+            signal.signal(signal.SIGINT, lambda *_: handled.append(1))
             os.kill(os.getpid(), number)
-        assert requested == [1]
+        assert handled == [1]
         assert signal.getsignal(number) == signal.SIG_DFL
         signal.signal(number, signal.SIG_IGN)
         with kill_as_interrupt():
             os.kill(os.getpid(), number)
-        assert requested == [1]
+        assert handled == [1]
     finally:
         signal.signal(number, usual)
         signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
-def test_a_process_ends_with_the_block_that_waits_for_it(ctrl_c):
-    """Also where Ctrl-C is ignored, as in the background of a script."""
+def test_process_ends_with_block_that_waits_for_it(ctrl_c):
+    """It ends even if Ctrl-C is ignored, as in the background of a script."""
 
     def waiting() -> subprocess.Popen[bytes]:
         before = signal.signal(signal.SIGINT, ctrl_c)
@@ -93,9 +93,7 @@ def usual_ctrl_c() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
-    store_path, tmp_path, monkeypatch, capsys
-):
+def test_ctrl_c_in_duckdb_callback_interrupts(store_path, tmp_path, monkeypatch, capsys):
     def stopped(*_: Any, **__: Any) -> None:
         with duckdb.connect(config={"threads": 1}) as connection:
             connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
@@ -109,15 +107,15 @@ def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_a_second_interrupt_ends_a_training_at_once(capsys):
+def test_second_interrupt_ends_training_at_once(capsys):
     with kill_as_interrupt(), _stop_on_interrupt() as stop:
         assert not stop()
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop()
-        deadline, said = time.monotonic() + 60, ""
-        while not said and time.monotonic() < deadline:
-            said = capsys.readouterr().err
-        assert said.startswith("stopping: a checkpoint is written after")
+        deadline, err = time.monotonic() + 60, ""
+        while not err and time.monotonic() < deadline:
+            err = capsys.readouterr().err
+        assert err.startswith("stopping: a checkpoint is written after")
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert was_interrupted()
@@ -126,10 +124,10 @@ def test_a_second_interrupt_ends_a_training_at_once(capsys):
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_what_duckdb_makes_of_an_interrupt_is_raised_as_one() -> None:
+def test_interrupt_in_duckdb_is_raised_as_interrupt() -> None:
     @interrupts_raised
-    def asks(query: str) -> None:
-        """Asks `query`, and says of what DuckDB says that the store is damaged, as callers may."""
+    def run_query(query: str) -> None:
+        """Run `query`; raise errors of DuckDB as a damaged store, as callers may."""
         with duckdb.connect(config={"threads": 1}) as connection:
             connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
             try:
@@ -138,9 +136,9 @@ def test_what_duckdb_makes_of_an_interrupt_is_raised_as_one() -> None:
                 raise StoreError("is damaged") from error
 
     with pytest.raises(KeyboardInterrupt):
-        asks("SELECT stop(1)")
+        run_query("SELECT stop(1)")
     with pytest.raises(StoreError):
-        asks("SELECT a")
+        run_query("SELECT a")
 
     def interrupts() -> None:
         time.sleep(0.2)
@@ -149,16 +147,16 @@ def test_what_duckdb_makes_of_an_interrupt_is_raised_as_one() -> None:
     with ThreadPoolExecutor(1) as pool:
         pool.submit(interrupts)
         with pytest.raises(KeyboardInterrupt):
-            asks("SELECT sum(a.range * b.range) FROM range(9000000) a, range(9000000) b")
+            run_query("SELECT sum(a.range * b.range) FROM range(9000000) a, range(9000000) b")
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt:
-        with pytest.raises(StoreError):  # what was handled before is none of its doing
-            asks("SELECT a")
+        with pytest.raises(StoreError):  # an interrupt that was handled before does not count
+            run_query("SELECT a")
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_an_interrupt_from_python_is_one_at_every_moment(store_path: Path, tmp_path: Path) -> None:
+def test_interrupt_at_any_moment_leaves_no_partial_panel(store_path: Path, tmp_path: Path) -> None:
     usual = signal.signal(signal.SIGALRM, signal.default_int_handler)
     done, after_s, panel = False, 0.01, tmp_path / "panel"
     try:

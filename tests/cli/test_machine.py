@@ -13,26 +13,26 @@ from restock.errors import ConfigError
 from restock.process import import_extra, install_command
 
 
-def reported(shell: Shell, *arguments: object, code: int = 0) -> dict[str, Any]:
+def findings_by_name(shell: Shell, *arguments: object, code: int = 0) -> dict[str, Any]:
     return {one["name"]: one for one in shell.json("info", *arguments, code=code)["findings"]}
 
 
-def test_a_machine_on_which_the_tests_run_is_well(store_path, shell):
-    found = reported(shell, store_path)
+def test_info_about_this_machine_is_ok(store_path, shell):
+    found = findings_by_name(shell, store_path)
     assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
-    found = reported(shell)
+    found = findings_by_name(shell)
     assert found["duckdb"]["what"] == metadata.version("duckdb")
     assert found["torch"]["state"] == "ok"
-    assert not {"ruff", "mypy", "pytest"} & set(found)  # what developers need is no extra
+    assert not {"ruff", "mypy", "pytest"} & set(found)  # packages for developers are not listed
 
 
-def test_what_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, shell):
+def test_missing_and_old_packages_have_remedy(monkeypatch, shell):
     wanted = [
         *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
         "of-another-machine>=1; platform_machine == 'pdp11'",
     ]
     monkeypatch.setattr(info, "requires", lambda _: wanted)
-    found = reported(shell, code=2)
+    found = findings_by_name(shell, code=2)
     assert found["duckdb"]["state"] == "wrong"
     assert ">=99 is needed" in found["duckdb"]["what"]
     assert found["no-such-package"]["state"] == "wrong"
@@ -53,7 +53,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, shell)
         ),
     ],
 )
-def test_an_extra_is_added_to_the_restock_that_is_installed(direct_url, command, monkeypatch):
+def test_install_command_fits_kind_of_installation(direct_url, command, monkeypatch):
     monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda *_: direct_url)
     assert install_command("onnx") == command
     monkeypatch.setitem(sys.modules, "onnx", None)

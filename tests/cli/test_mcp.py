@@ -1,4 +1,4 @@
-"""`restock-mcp`, asked by the client of the protocol's own SDK over stdio."""
+"""`restock-mcp`, queried over stdio by the client of the protocol's SDK."""
 
 import json
 import os
@@ -15,8 +15,8 @@ from restock import cli
 SERVE = "import sys; from restock.cli import run_mcp; sys.exit(run_mcp())"
 
 
-def ask(place: Path, job: Callable[[Any], Awaitable[None]], *options: str) -> None:
-    """Start a server of a place, and let a client of it do a job."""
+def run_job(place: Path, job: Callable[[Any], Awaitable[None]], *options: str) -> None:
+    """Start a server for `place` and run `job` with a client of it."""
     mcp = pytest.importorskip("mcp", reason="the extra mcp is not installed")
     anyio = pytest.importorskip("anyio")
     server = mcp.StdioServerParameters(
@@ -30,14 +30,14 @@ def ask(place: Path, job: Callable[[Any], Awaitable[None]], *options: str) -> No
     anyio.run(run)
 
 
-async def answer(client: Any, tool: str, **arguments: Any) -> Any:
-    """Return a tool's answer, or its error as text."""
+async def call(client: Any, tool: str, **arguments: Any) -> Any:
+    """Return a tool's result, or its error as text."""
     found = await client.call_tool(tool, arguments)
     text = found.content[0].text
     return text if found.is_error else json.loads(text)
 
 
-def test_an_assistant_asks_a_store(store_path, tmp_path):
+def test_tools_on_store_are_read_only(store_path, tmp_path):
     outside = tmp_path / "secret.csv"
     outside.write_text("a\n1\n")
     refused = {
@@ -58,55 +58,55 @@ def test_an_assistant_asks_a_store(store_path, tmp_path):
         names = [tool.name for tool in tools]
         assert names == ["sql", "coverage", "events", "trace", "diagnose", "gate"]
         assert all(tool.annotations.read_only_hint and tool.description for tool in tools)
-        rows = await answer(client, "sql", query="SELECT step_index FROM transitions ORDER BY ALL")
+        rows = await call(client, "sql", query="SELECT step_index FROM transitions ORDER BY ALL")
         assert rows["columns"] == ["step_index"]
         assert len(rows["rows"]) == 3 < rows["all_rows"]
         for query, message in refused.items():
-            assert message in await answer(client, "sql", query=query), query
-        found = await answer(client, "coverage")
+            assert message in await call(client, "sql", query=query), query
+        found = await call(client, "coverage")
         assert "nominal" in {row["condition"] for row in found["conditions"][:3]}
-        events = await answer(client, "events", condition="it's none")
+        events = await call(client, "events", condition="it's none")
         assert events["all_rows"] == 0
-        rows = await answer(client, "sql", query="SELECT min(transition_id) AS id FROM transitions")
-        traced = await answer(client, "trace", row=str(rows["rows"][0]["id"]))
+        rows = await call(client, "sql", query="SELECT min(transition_id) AS id FROM transitions")
+        traced = await call(client, "trace", row=str(rows["rows"][0]["id"]))
         assert traced["transition"]["step_index"] == 0
-        assert "is not a row" in await answer(client, "trace", row="--recording=/tmp/x.mcap")
-        assert "restock gate RUN" in await answer(client, "gate")
+        assert "is not a row" in await call(client, "trace", row="--recording=/tmp/x.mcap")
+        assert "restock gate RUN" in await call(client, "gate")
 
     before = sorted(tmp_path.iterdir())
-    ask(store_path, job, "--rows", "3")
+    run_job(store_path, job, "--rows", "3")
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_question_that_takes_too_long_is_stopped(store_path):
+def test_slow_queries_are_stopped(store_path):
     endless = "SELECT count(*) FROM range(100000000) a, range(100000000) b"
 
     async def job(client: Any) -> None:
-        assert "stopped after 0.5 s" in await answer(client, "sql", query=endless)
-        assert "stopped after 0.5 s" in await answer(client, "diagnose")
+        assert "stopped after 0.5 s" in await call(client, "sql", query=endless)
+        assert "stopped after 0.5 s" in await call(client, "diagnose")
 
-    ask(store_path, job, "--seconds", "0.5")
+    run_job(store_path, job, "--seconds", "0.5")
 
 
-def test_an_assistant_asks_recordings(tmp_path):
+def test_tools_on_recording(tmp_path):
     whole = write_bag(tmp_path / "whole", storage="mcap", count=500)
     (file,) = whole.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
     async def job(client: Any) -> None:
-        rows = await answer(client, "sql", query="SELECT ranges FROM scan LIMIT 1")
+        rows = await call(client, "sql", query="SELECT ranges FROM scan LIMIT 1")
         assert rows["rows"][0]["ranges"][0] is None  # inf
-        assert "disabled" in await answer(client, "sql", query=f"FROM read_blob('{cut}')")
-        assert "not a store" in await answer(client, "coverage")
-        rows = await answer(client, "sql", query="SELECT count(*) AS n FROM odom")
+        assert "disabled" in await call(client, "sql", query=f"FROM read_blob('{cut}')")
+        assert "not a store" in await call(client, "coverage")
+        rows = await call(client, "sql", query="SELECT count(*) AS n FROM odom")
         assert 0 < rows["rows"][0]["n"] < 500
         assert "cut short" in rows["lost"][0]
 
-    ask(cut, job)
+    run_job(cut, job)
 
 
-def test_a_missing_extra_is_named_with_the_command(tmp_path, monkeypatch, capsys):
+def test_missing_extra_names_install_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mcp", None)
     assert cli.run_mcp([str(tmp_path)]) == 2
     err = capsys.readouterr().err

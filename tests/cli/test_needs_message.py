@@ -1,4 +1,4 @@
-"""What `restock ingest` says of a recording of another robot: what to do, and no wrong guesses."""
+"""Errors of `restock ingest` for a recording that lacks topics of the profile."""
 
 from types import SimpleNamespace
 
@@ -16,7 +16,7 @@ def topic(kind: str, skipped: str | None = None) -> SimpleNamespace:
     return SimpleNamespace(type=kind, expected=9, skipped=skipped)
 
 
-def test_a_topic_that_was_skipped_is_not_called_absent() -> None:
+def test_skipped_topic_is_not_reported_missing() -> None:
     profile = load_profile("warehouse_amr")
     there = {s.topic: topic(s.type) for s in profile.sources.values()}
     leaves = {s.topic: [Leaf(p, (), "") for p in field_paths(s)] for s in profile.sources.values()}
@@ -24,7 +24,7 @@ def test_a_topic_that_was_skipped_is_not_called_absent() -> None:
     optional = next(s.topic for s in profile.sources.values() if s.optional)
     there[optional] = topic("a_msgs/msg/Own", "unknown type a_msgs/msg/Own")
     leaves[optional] = []
-    assert optional in wanted_fields(profile, there, leaves).keys() & wanted.keys()  # to be counted
+    assert optional in wanted_fields(profile, there, leaves).keys() & wanted.keys()
     there["/cmd_vel"] = topic(there["/cmd_vel"].type, "its definition cannot be parsed at 'x'")
     with pytest.raises(RecordingError) as error:
         wanted_fields(profile, there, leaves)

@@ -1,4 +1,4 @@
-"""A fleet's night: a line for each recording, and one total, whose figures are those of --json."""
+"""A folder of recordings: a line per recording, and a total with the figures of --json."""
 
 from collections import Counter
 from pathlib import Path
@@ -27,7 +27,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, shell):
+def test_folder_prints_line_per_recording_and_total(bags, tmp_path, shell):
     rows, dropped, labels = totals(shell.json("ingest", bags, "--dry-run", code=3)["recordings"])
     out, err = shell.printed("ingest", bags, "--store", tmp_path / "s", code=3)
     *lines, total = out.splitlines()
@@ -48,7 +48,7 @@ def test_a_folder_is_a_line_each_and_one_total(bags, tmp_path, shell):
     assert "lost data 1" in out.splitlines()[-1]
 
 
-def test_one_recording_and_verbose_say_everything(bags, shell):
+def test_single_recording_and_verbose_print_details(bags, shell):
     one = shell.out("ingest", bags / "drive0", "--dry-run")
     assert "episodes ended by: " in one
     out, err = shell.printed("ingest", bags, "--dry-run", "--verbose", code=3)
@@ -56,7 +56,7 @@ def test_one_recording_and_verbose_say_everything(bags, shell):
     assert "--salvage" in err
 
 
-def test_info_of_a_folder_ends_with_its_totals(bags, shell):
+def test_info_of_folder_ends_with_totals(bags, shell):
     found = shell.json("info", bags, code=2)["recordings"]
     total, topics = shell.out("info", bags, code=2).splitlines()[-2:]
     assert total.startswith("total: 4 recordings; ")
@@ -67,7 +67,7 @@ def test_info_of_a_folder_ends_with_its_totals(bags, shell):
 
 
 @pytest.mark.skipif(not (SHARED / "fleet-neato").is_dir(), reason="no fleet-neato")
-def test_eleven_recordings_of_strangers_are_twelve_lines(tmp_path, shell):
+def test_public_fleet_prints_line_per_recording(tmp_path, shell):
     fleet, profile = SHARED / "fleet-neato", tmp_path / "neato.toml"
     main(["profile", "new", str(fleet), "--out", str(profile)])
     words = ["ingest", str(fleet), "--profile", str(profile), "--store", str(tmp_path / "s")]

@@ -1,4 +1,4 @@
-"""A task without a goal has no success: null and "no goal" everywhere, in place of 0 %."""
+"""A task without a goal has no success: null and "no goal" everywhere, instead of 0 %."""
 
 import json
 import re
@@ -21,7 +21,7 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a short training under a profile that only says how to drive, not where to."""
+    """Return the run of a short training whose profile has no goal."""
     root = tmp_path_factory.mktemp("no_goal")
     text = (files("restock.ingest.profile") / "profiles" / "warehouse_amr.toml").read_text("utf-8")
     text = text.replace('goal = "route"', 'goal = "none"')
@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "run"
 
 
-def test_training_records_no_success(run: Path) -> None:
+def test_training_records_null_success(run: Path) -> None:
     for name in ("progress", "episodes", "evaluations"):
         table = pq.read_table(run / f"{name}.parquet")
         assert len(table), name
@@ -41,7 +41,7 @@ def test_training_records_no_success(run: Path) -> None:
 
 
 @pytest.mark.long
-def test_eval_report_and_card_say_no_goal(run, shell):
+def test_eval_report_and_card_show_no_goal(run, shell):
     evaluate = ["eval", str(run), "--episodes", "1", "--perturbations", "none"]
     results = shell.json(*evaluate, "--policies", "agent,planner")["results"]
     assert results

@@ -16,7 +16,7 @@ ROWS = [
 ]
 
 
-def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(monkeypatch, capsys):
+def test_terminal_table_has_colours_and_fits_width(monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "72")
@@ -35,8 +35,8 @@ def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(monkeypatch, capsy
     assert max(map(len, bare.splitlines())) <= 72
 
 
-def test_a_long_recording_shows_how_far_it_is(monkeypatch, shell):
-    """On stderr, if that is a terminal: what is read of a recording, and of how much."""
+def test_ingest_reports_progress_of_each_stage(monkeypatch, shell):
+    """Each stage reports the part done and the whole, if stderr is a terminal."""
     reported: list[tuple[str, int, int]] = []
     original = output.Advance.part
 
@@ -64,8 +64,8 @@ def test_a_long_recording_shows_how_far_it_is(monkeypatch, shell):
         assert 0.9 * whole[-1] <= done[-1] <= whole[-1]
 
 
-def test_a_bar_leaves_what_goes_into_a_file_alone() -> None:
-    """A terminal that shows a bar, while stdout is a file: what is printed meanwhile is data."""
+def test_progress_bar_does_not_mix_with_stdout() -> None:
+    """The bar is on the terminal while stdout, a pipe, gets the data."""
     import pty
 
     code = (

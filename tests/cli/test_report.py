@@ -1,4 +1,4 @@
-"""The report: one page that opens offline, says what the run's tables say, and trusts no name."""
+"""The report: one offline page with the figures of the run's tables and escaped names."""
 
 import json
 import re
@@ -30,7 +30,7 @@ HOSTILE = "<script>alert(1)</script>"
 
 
 def fill(run: Run, table: str, *rows: dict[str, Any], **values: Any) -> None:
-    """Append rows to a run's table; what is not given is a plain value of the column's type."""
+    """Append rows to a run's table; other columns get a default value of their type."""
     plain = [
         (pa.types.is_boolean, False),
         (pa.types.is_floating, 0.5),
@@ -110,7 +110,7 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.path
 
 
-def test_the_replay_card_answers_every_question(run: Path, shell) -> None:
+def test_replay_card_has_figures_of_run(run: Path, shell) -> None:
     card = shell.json("report", run, "--card")
     assert card["capacity"]["ring_rows"] == 4096
     assert card["capacity"]["panel_rows"] > 0
@@ -132,7 +132,7 @@ def test_the_replay_card_answers_every_question(run: Path, shell) -> None:
     assert json.loads((run / "replay_card.json").read_text()) == card
 
 
-def test_the_replay_card_is_a_page_that_trusts_no_name(run: Path, shell) -> None:
+def test_replay_card_escapes_names(run: Path, shell) -> None:
     page = shell.out("report", run, "--card")
     assert (run / "replay_card.md").read_text() == page
     assert "<script" not in page
@@ -143,7 +143,7 @@ def html(run: Path) -> str:
     return build_report(run).read_text(encoding="utf-8")
 
 
-def test_its_charts_are_specifications_that_vega_takes(html: str) -> None:
+def test_charts_are_valid_vega_lite(html: str) -> None:
     page = charts_of(html)
     assert len(page["charts"]) >= 10
     for chart in page["charts"]:
@@ -151,19 +151,19 @@ def test_its_charts_are_specifications_that_vega_takes(html: str) -> None:
         assert "Undefined" not in json.dumps(vl_convert.vegalite_to_vega(spec))
 
 
-def test_the_page_fetches_nothing_and_trusts_no_name(html: str) -> None:
+def test_page_is_offline_and_escapes_names(html: str) -> None:
     assert Page(html).tags.count("script") == 3  # rows, Vega, and what draws with it
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text
 
 
-def test_the_headline_is_a_comparison_with_its_interval(run: Path) -> None:
+def test_headline_is_comparison_with_interval(run: Path) -> None:
     found = headline(gather(run))
     assert re.match(r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\)", found)
 
 
 @pytest.mark.long
-def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
+def test_twin_gap_has_section(run: Path, tmp_path: Path) -> None:
     position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
     position |= {"source": "nominal", "segments": 40, "episodes": 9}
     position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
@@ -188,18 +188,18 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     assert '<section id="twin-gap">' not in page
 
 
-def test_the_evaluation_bias_is_named(run: Path) -> None:
+def test_evaluation_bias_is_reported(run: Path) -> None:
     facts = gather(run)
     facts.logged = [
         {"condition": "nominal", "share": 0.1, "episodes": 1},
         {"condition": "wheel_slip", "share": 0.9, "episodes": 9},
     ]
-    # Half of the evaluation is nominal, which is easier, but a tenth of what was logged.
+    # Nominal is easier, and half of the evaluation, but only a tenth of the logs.
     assert "success would be 27% instead of 55%" in evaluation_bias(facts)
     assert "largest bias comes from nominal" in evaluation_bias(facts)
 
 
-def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None:
+def test_run_without_evaluation_has_page(tmp_path: Path) -> None:
     made = Run.create(tmp_path / "run", {"config": {"target": {"rule": "polyak", "tau": 0.005}}})
     fill(made, "progress", phase="offline")
     made.flush()
@@ -219,7 +219,7 @@ def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> Facts:
     return gather(path)
 
 
-def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
+def test_floor_drawing_uses_layout_of_run(run: Path, tmp_path: Path) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
     section = floor_section(_on_floors(run, tmp_path / "hall", str(hall), "hall.toml"))
@@ -230,13 +230,13 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     assert floor_section(_on_floors(run, tmp_path / "default", str(hall), "default")) is None
 
 
-def test_the_verb_writes_the_page(run, tmp_path, shell):
+def test_report_verb_writes_page(run, tmp_path, shell):
     out = tmp_path / "deep" / "page.html"
-    said = shell.json("report", run, "--out", out)
-    assert said == {"report": str(out), "bytes": out.stat().st_size}
+    document = shell.json("report", run, "--out", out)
+    assert document == {"report": str(out), "bytes": out.stat().st_size}
 
 
-def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path, shell):
+def test_no_verb_writes_into_store_or_other_run(run, store_path, tmp_path, shell):
     own = tmp_path / "run"
     shutil.copytree(run, own)
     before = sorted([*store_path.rglob("*"), *run.rglob("*")])
@@ -256,7 +256,7 @@ def test_no_command_writes_into_a_store_or_another_run(run, store_path, tmp_path
     assert sorted([*store_path.rglob("*"), *run.rglob("*")]) == before
 
 
-def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
+def test_missing_and_untrained_runs_are_refused(tmp_path: Path) -> None:
     Run.create(tmp_path / "run", {"config": {}})
     (tmp_path / "empty").mkdir()
     for place in (tmp_path / "nothing", tmp_path / "empty", tmp_path / "run"):
@@ -266,7 +266,7 @@ def test_what_is_no_run_or_has_no_update_is_refused(tmp_path: Path) -> None:
         assert cli.main(["report", str(place)]) == 2
 
 
-def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
+def test_chance_level_policy_is_not_called_better(run: Path) -> None:
     facts = gather(run)
     facts.cells += [
         {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")

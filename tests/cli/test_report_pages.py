@@ -1,4 +1,4 @@
-"""Pages of a comparison, a study and a store: verdict first, nothing fetched, no name trusted."""
+"""Pages of a study, a store and a folder of runs: figures of their data, and escaped names."""
 
 import json
 import math
@@ -27,7 +27,7 @@ def read(page: Path) -> Page:
     return found
 
 
-def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
+def test_study_page_shows_findings(tmp_path: Path) -> None:
     ends = {"success nominal": [0.9, 0.8, 1.1], "success wheel_slip": [0.5, None, None]}
     comparison = {
         "arm": HOSTILE,
@@ -62,7 +62,7 @@ def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
     assert HOSTILE in found.text  # shown, as text
 
 
-def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, shell):
+def test_coverage_page_has_sections(store_path, tmp_path, shell):
     page = tmp_path / "page.html"
     argv = ["coverage", str(store_path), "--out", str(page)]
     assert "rows that hold each condition" in shell.out(*argv)
@@ -74,7 +74,7 @@ def test_a_store_has_a_page_of_what_it_holds(store_path, tmp_path, shell):
     assert main(["coverage", str(store_path), *alone]) == 2
 
 
-def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> None:
+def test_coverage_page_counts_rows_per_condition(store_path: Path) -> None:
     with Store(store_path) as store:
         sections = coverage_of(store)
         slips = "SELECT count(*) FROM transitions WHERE"
@@ -108,8 +108,8 @@ def coverage_of(store: Store) -> dict[str, Any]:
     return {section.id: section for section in page["sections"] if section is not None}
 
 
-def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) -> None:
-    """Each robot's row once held its hours times the number of conditions that it had met."""
+def test_robot_hours_are_rows_times_control_period(tmp_path: Path) -> None:
+    """Regression: a robot's hours were multiplied by the number of its conditions."""
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     tags = [{"robot": "a"}, {"robot": "a"}, {"robot": "b"}]
     with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
@@ -128,8 +128,8 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert {round(row["hours"], 9) for row in weeks} == {round(every, 9)}
 
 
-def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
-    """A run whose TD error became NaN had no page at all."""
+def test_chart_has_gaps_for_non_finite_values() -> None:
+    """Regression: a run whose TD error became NaN had no page."""
     values = [0.5, math.nan, np.float32("inf"), 1.0]
     rows = [{"step": step, "td": value} for step, value in enumerate(values)]
     drawing = charts.draw(lambda _: charts.plot(rows).mark_line().encode(x="step:Q", y="td:Q"))
@@ -142,7 +142,7 @@ def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
     assert [row["td"] for row in shown] == [0.5, None, None, 1.0]
 
 
-def test_a_folder_of_runs_shows_what_changed(store_path, tmp_path, shell):
+def test_folder_page_shows_changes_between_runs(store_path, tmp_path, shell):
     folder = tmp_path / "night"
     wider = {"config__replay__batch_size": 7}
     make_run(folder / "runs" / "<b>monday", document(0, created_ns=1), success=0.2)

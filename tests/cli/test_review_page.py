@@ -1,4 +1,4 @@
-"""`restock review`: the page in a browser, its server, and what becomes of the verdicts."""
+"""`restock review`: the page in a browser, its server, and the verdicts that it stores."""
 
 import csv
 import http.client
@@ -56,12 +56,12 @@ def store(made: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def in_process(store: Path) -> Iterator[tuple[Server, list[str]]]:
-    said: list[str] = []
+    messages: list[str] = []
     review = Review(Location.of(store))
-    with Server(review, said.append) as server:
+    with Server(review, messages.append) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()
-        yield server, said
+        yield server, messages
         server.shutdown()
         thread.join()
     review.close()
@@ -85,7 +85,7 @@ def opened(browser: Browser, address: str, **size: int) -> Tab:
     return tab
 
 
-def test_verdicts_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
+def test_verdicts_by_keys_equal_verdicts_by_csv(browser, store, made, tmp_path):
     same = Path(shutil.copytree(made, tmp_path / "same"))
     with Store(store) as read:
         known = {event.event: event for event in doubtful_events(read)}
@@ -95,15 +95,15 @@ def test_verdicts_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
         for number in range(10):
             event = known[tab.run("review.here()")]
             place = (event.episode_id, event.condition, event.first_step, event.last_step)
-            if number % 5 == 4:  # it ends where the slider is, a step after it begins
+            if number % 5 == 4:  # the event ends at the slider, a step after it begins
                 press(tab, ".", "]", "y")
                 ends = sorted((event.first_step, event.first_step + 1))
                 whole = ends == [event.first_step, event.last_step]
-                said = "yes" if whole else f"{ends[0]}..{ends[1]}"
+                verdict = "yes" if whole else f"{ends[0]}..{ends[1]}"
             else:
-                said = "no" if number % 2 else "yes"
-                press(tab, said[0])
-            verdicts.append((*place, said))
+                verdict = "no" if number % 2 else "yes"
+                press(tab, verdict[0])
+            verdicts.append((*place, verdict))
         assert "10 judged" in tab.text("#progress")
         tab.close()
         code, _ = server.end()
@@ -118,7 +118,7 @@ def test_verdicts_by_keys_equal_those_by_csv(browser, store, made, tmp_path):
     assert rows(store, LABELS) != rows(made, LABELS)
 
 
-def test_another_condition_a_mark_a_note_and_undo(browser, in_process, store):
+def test_other_condition_note_mark_and_undo(browser, in_process, store):
     server, _ = in_process
     tab = opened(browser, server.address)
     first = tab.run("review.here()")
@@ -128,8 +128,8 @@ def test_another_condition_a_mark_a_note_and_undo(browser, in_process, store):
     press(tab, "1")
     tab.wait(f"review.here() !== {json.dumps(first)} && review.moment()")
     counting = Journal(Location.of(store)).counting()
-    said = {(one.condition, one.verdict) for one in counting}
-    assert said == {(condition, "no"), (other, "yes")}
+    verdicts = {(entry.condition, entry.verdict) for entry in counting}
+    assert verdicts == {(condition, "no"), (other, "yes")}
     press(tab, "u")
     assert tab.run("review.here()") == first
     assert Journal(Location.of(store)).counting() == []
@@ -150,7 +150,7 @@ def test_another_condition_a_mark_a_note_and_undo(browser, in_process, store):
     assert (condition, True) in found
 
 
-def test_the_ends_of_an_event_can_be_dragged(browser, in_process, store):
+def test_ends_of_event_can_be_dragged(browser, in_process, store):
     tab = opened(browser, in_process[0].address)
     tab.run("document.querySelector('.handle').scrollIntoView({block: 'center'})")
     box = "document.querySelector('.handle[data-end=\"1\"]').getBoundingClientRect()"
@@ -165,7 +165,7 @@ def test_the_ends_of_an_event_can_be_dragged(browser, in_process, store):
     tab.close()
 
 
-def test_names_stay_text(browser, tmp_path):
+def test_names_are_escaped(browser, tmp_path):
     table = replaced(recording_transitions(1, episodes=1), {"source_file": f"{HOSTILE}.mcap"})
     path = tmp_path / "store"
     StoreWriter(path).write(manifest(table, tags={"robot": HOSTILE}), table)
@@ -176,7 +176,7 @@ def test_names_stay_text(browser, tmp_path):
         tab.close()
 
 
-def test_a_killed_server_loses_nothing(browser, store):
+def test_killed_server_loses_no_verdict(browser, store):
     server = ServedReview(store)
     tab = opened(browser, server.address)
     press(tab, *"yynyn")
@@ -191,18 +191,18 @@ def test_a_killed_server_loses_nothing(browser, store):
         assert "5 judged" in tab.text("#progress")
         press(tab, "n")
         tab.close()
-        _, said = again.end()
-    assert "5 verdicts of an earlier review wait in" in said
-    assert "6 verdicts are written, 0 held back" in said
+        _, printed = again.end()
+    assert "5 verdicts of an earlier review wait in" in printed
+    assert "6 verdicts are written, 0 held back" in printed
     assert len(Journal(Location.of(store)).lines) == 7
     assert Journal(Location.of(store)).counting() == []
 
 
-def test_two_people_and_two_servers_lose_no_verdict(browser, store):
+def test_two_servers_lose_no_verdict(browser, store):
     with ServedReview(store) as one_server, ServedReview(store) as other_server:
         anna, ben = opened(browser, one_server.address), opened(browser, other_server.address)
         event = anna.run("review.here()")
-        assert ben.run("review.here()") == event  # as nobody has judged it
+        assert ben.run("review.here()") == event  # as it has no verdict yet
         press(anna, "y")
         press(ben, "n")
         both = Journal(Location.of(store)).counting()
@@ -233,15 +233,15 @@ def test_precision_is_estimated_in_random_order(browser, in_process):
     tab.wait(READY)
     press(tab, *"yynyyyny")
     low, high = wilson(6, 8)
-    told = f"6 of 8 labels are right: 0.75 (95 %: {low:.2f} to {high:.2f})"
-    assert told in tab.text("#estimate")
-    press(tab, "ArrowRight", "n")  # past one: it says so, and does not count what comes after
+    estimate = f"6 of 8 labels are right: 0.75 (95 %: {low:.2f} to {high:.2f})"
+    assert estimate in tab.text("#estimate")
+    press(tab, "ArrowRight", "n")  # skips an event: later verdicts are reported, but not counted
     assert "6 of 8 labels" in tab.text("#estimate")
     assert "1 after a skipped one" in tab.text("#estimate")
     tab.close()
 
 
-def test_the_page_fits_a_phone_and_a_thumb(browser, in_process):
+def test_page_fits_phones_and_touch(browser, in_process):
     for width, height in ((390, 844), (768, 1024), (1440, 900)):
         tab = opened(browser, in_process[0].address, width=width, height=height)
         assert tab.run("document.documentElement.scrollWidth") <= width
@@ -256,8 +256,8 @@ def test_the_page_fits_a_phone_and_a_thumb(browser, in_process):
         tab.close()
 
 
-def asked(address: str, method: str, path: str, **headers: str) -> tuple[int, str]:
-    """Return status and body of a request that no page sends."""
+def send_request(address: str, method: str, path: str, **headers: str) -> tuple[int, str]:
+    """Send a request outside the page, and return its status and body."""
     parts = urlsplit(address)
     link = http.client.HTTPConnection("127.0.0.1", parts.port)
     body = b"{}" if method == "POST" else None
@@ -268,7 +268,7 @@ def asked(address: str, method: str, path: str, **headers: str) -> tuple[int, st
     return answer.status, text
 
 
-def test_only_the_page_is_answered(in_process):
+def test_only_requests_of_page_are_answered(in_process):
     server, _ = in_process
     path, own = f"/{server.token}/", {"Origin": server.address.split("/" + server.token)[0]}
     for method, at, headers, why in (
@@ -280,13 +280,13 @@ def test_only_the_page_is_answered(in_process):
         ("POST", path + "state", {}, "not from the review page"),
         ("POST", path + "state", {"Origin": "null"}, "not from the review page"),
     ):
-        status, text = asked(server.address, method, at, **headers)
+        status, text = send_request(server.address, method, at, **headers)
         assert (status, why in text) == (403, True), (method, at, headers)
-    assert asked(server.address, "GET", path)[0] == 200
-    assert asked(server.address, "POST", path + "state", **own)[0] == 200
+    assert send_request(server.address, "GET", path)[0] == 200
+    assert send_request(server.address, "POST", path + "state", **own)[0] == 200
     for at in ("../etc/passwd", "moment/-1", "moment/x", "style.css"):
-        assert asked(server.address, "GET", path + at)[0] == 404
-    assert asked(server.address, "GET", path + "moment/99999")[0] == 409
+        assert send_request(server.address, "GET", path + at)[0] == 404
+    assert send_request(server.address, "GET", path + "moment/99999")[0] == 409
     link = http.client.HTTPConnection("127.0.0.1", server.server_port)
     link.request("GET", path)
     answer = link.getresponse()
@@ -298,16 +298,16 @@ def test_only_the_page_is_answered(in_process):
     link.close()
 
 
-def test_another_port_is_taken_if_it_is_in_use(in_process, store):
-    _, said = in_process
+def test_other_port_is_taken_if_in_use(in_process, store):
+    _, messages = in_process
     review = Review(Location.of(store))
-    with Server(review, said.append) as second:
+    with Server(review, messages.append) as second:
         assert second.server_port != PORT
     review.close()
-    assert f"port {PORT} is in use: this review has port" in said[-1]
+    assert f"port {PORT} is in use: this review has port" in messages[-1]
 
 
-def given(review: Review, place: int = 0, **changed: object) -> Entry:
+def entry_for(review: Review, place: int = 0, **changed: object) -> Entry:
     event = review.data["events"][place]
     values = {
         name: event[name]
@@ -316,20 +316,20 @@ def given(review: Review, place: int = 0, **changed: object) -> Entry:
     return Entry(**({"id": f"v{place}", "by": "anna", "verdict": "no"} | values | changed))
 
 
-def test_a_store_may_be_compacted_meanwhile(in_process, store):
+def test_store_can_be_compacted_during_review(in_process, store):
     review = in_process[0].review
     assert main(["store", "compact", str(store)]) == 0
-    review.give([given(review)])
+    review.give([entry_for(review)])
     assert review.moment(1)["steps"]
     assert review.write().version is not None
-    review.give([given(review, 1)])  # the labels that it wrote do not stand in its own way
+    review.give([entry_for(review, 1)])  # no conflict with the labels just written
     assert review.write().taken == 1
     assert len(rows(store, "FROM corrections")) == 2
 
 
-def test_a_verdict_on_replaced_rows_is_refused_in_a_sentence(in_process, store):
+def test_verdict_on_replaced_rows_is_refused(in_process, store):
     review = in_process[0].review
-    review.give([given(review)])
+    review.give([entry_for(review)])
     recording = review.data["events"][0]["recording"]
     table = recording_transitions(int(recording, 16), ingest="b", episodes=3)
     stamps = table["stamp_ns"].to_numpy().copy()
@@ -337,7 +337,7 @@ def test_a_verdict_on_replaced_rows_is_refused_in_a_sentence(in_process, store):
     table = replaced(table, {"stamp_ns": stamps})
     StoreWriter(store).write(manifest(table), table)
     with pytest.raises(LabelError, match="the recording was ingested again in the meantime"):
-        review.give([given(review, id="later")])
+        review.give([entry_for(review, id="later")])
     written = review.write()
     assert written.version is None
     (why,) = written.held_back
@@ -345,7 +345,7 @@ def test_a_verdict_on_replaced_rows_is_refused_in_a_sentence(in_process, store):
     assert [one.id for one in review.journal.counting()] == ["v0"]  # it is kept
 
 
-def test_a_verdict_that_does_not_fit_is_not_taken(in_process):
+def test_invalid_verdicts_are_refused(in_process):
     review = in_process[0].review
     for changed, why in (
         ({"condition": "wheelslip"}, "no condition 'wheelslip'"),
@@ -353,5 +353,5 @@ def test_a_verdict_that_does_not_fit_is_not_taken(in_process):
         ({"episode_id": "gone/3"}, "no episode"),
     ):
         with pytest.raises(LabelError, match=why):
-            review.give([given(review, **changed)])
+            review.give([entry_for(review, **changed)])
     assert review.journal.lines == []

@@ -1,4 +1,4 @@
-"""`restock profile schema`: an editor accepts what Restock reads, and nothing else."""
+"""`restock profile schema`: the schemas accept what Restock reads, and nothing else."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ def problems(name: str, document: dict[str, Any]) -> list[str]:
 
 
 def kind_of(path: str, document: dict[str, Any]) -> str | None:
-    """Return what a shipped TOML file is, by where it lies and what it holds."""
+    """Return the kind of a shipped TOML file, by its path and keys."""
     if path.startswith("ingest/profile/profiles/"):
         return "profile"
     if path.startswith(("replay/mixture/mixtures/", "benchmarks/")):
@@ -33,10 +33,10 @@ def kind_of(path: str, document: dict[str, Any]) -> str | None:
 
 
 def shipped() -> list[tuple[str, str]]:
-    reported = subprocess.run(
+    tracked = subprocess.run(
         ["git", "ls-files", "*.toml"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.split()
-    files = reported or [
+    files = tracked or [
         str(p.relative_to(ROOT)) for p in (ROOT / "replay").rglob("mixtures/*.toml")
     ]
     found = [(path, kind_of(path, tomllib.loads((ROOT / path).read_text()))) for path in files]
@@ -44,18 +44,18 @@ def shipped() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_a_schema_is_one(name: str) -> None:
+def test_schema_is_valid(name: str) -> None:
     Draft202012Validator.check_schema(SCHEMAS[name])
     assert SCHEMAS[name]["title"] == f"Restock {name}"
     assert problems(name, {"nothing_has_this_key": 1})
 
 
 @pytest.mark.parametrize(("path", "kind"), shipped())
-def test_every_shipped_file_is_accepted(path: str, kind: str) -> None:
+def test_shipped_file_is_accepted(path: str, kind: str) -> None:
     assert problems(kind, tomllib.loads((ROOT / path).read_text())) == []
 
 
-def test_what_restock_itself_writes_is_accepted() -> None:
+def test_written_configs_are_accepted() -> None:
     assert problems("train", _without_null(msgspec.to_builtins(TrainConfig()))) == []
     for perturbation in PERTURBATIONS.values():
         assert problems("perturbation", _without_null(msgspec.to_builtins(perturbation))) == []
@@ -68,7 +68,7 @@ def _without_null(value: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("name", "toml", "said"),
+    ("name", "toml", "problem"),
     [
         ("train", "[loss]\nn_steps = 3", "n_steps"),
         ("train", "[loss]\nn_step = 0", "less than the minimum"),
@@ -80,11 +80,11 @@ def _without_null(value: Any) -> Any:
         ("missions", "[[missions]]\nkind = 'nominal'\nmissions = 2\nzones = 'a'", "zones"),
     ],
 )
-def test_what_restock_refuses_is_underlined(name: str, toml: str, said: str) -> None:
-    assert said in "; ".join(problems(name, tomllib.loads(toml)))
+def test_invalid_config_is_rejected(name: str, toml: str, problem: str) -> None:
+    assert problem in "; ".join(problems(name, tomllib.loads(toml)))
 
 
-def test_the_command_prints_schemas_and_lists_them(shell):
+def test_schema_verb_lists_and_prints_schemas(shell):
     assert [row["name"] for row in shell.json("profile", "schema")] == list(CONFIGS)
     assert json.loads(shell.out("profile", "schema", "study")) == SCHEMAS["study"]
     assert "choose one of train" in shell.err("profile", "schema", "robot")

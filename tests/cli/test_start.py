@@ -1,4 +1,4 @@
-"""`restock start` takes a stranger's bag stage by stage, and stops where a person must decide."""
+"""`restock start`: stages from a bag to a report, with stops if a person must decide."""
 
 import json
 import re
@@ -22,7 +22,7 @@ SILENT = lambda line: None  # noqa: E731
 
 
 class Verbs:
-    """Stands in for the command line: writes what a stage should, and counts."""
+    """Fake command line: creates the output folders of a stage and records verbs."""
 
     def __init__(self) -> None:
         self.ran: list[str] = []
@@ -36,8 +36,8 @@ class Verbs:
         return self.codes.get(command[0], 0)
 
 
-def way(out: Path, verbs: Verbs, bag: Path, number: int = 1) -> list[str]:
-    """Three stages, one of the user's files, one that can be resumed; each one's status."""
+def run_stages(out: Path, verbs: Verbs, bag: Path, number: int = 1) -> list[str]:
+    """Run three stages, one of which can be resumed, and return their statuses."""
     work = Work(out, verbs, SILENT)
     store, run = out / "store", out / "run"
     stages = [
@@ -55,38 +55,38 @@ def bag(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_a_changed_input_decides_is_done_again(tmp_path: Path, bag: Path) -> None:
+def test_stages_with_changed_input_run_again(tmp_path: Path, bag: Path) -> None:
     verbs, out = Verbs(), tmp_path / "out"
-    way(out, verbs, bag)
-    assert way(out, verbs, bag, number=2) == ["kept", "done", "done"]  # another command
+    run_stages(out, verbs, bag)
+    assert run_stages(out, verbs, bag, number=2) == ["kept", "done", "done"]  # another command
     (out / "run" / "mine.txt").write_text("a note")
     bag.write_bytes(b"other messages")
-    assert way(out, verbs, bag, number=2) == ["done"] * 3
-    # Training takes long: what it left before is put aside, and not removed.
+    assert run_stages(out, verbs, bag, number=2) == ["done"] * 3
+    # Training takes long, so its earlier output is moved aside, not removed.
     assert (out / "earlier" / "run-2" / "mine.txt").read_text() == "a note"
     (out / "store").rmdir()
-    assert way(out, verbs, bag, number=2) == ["done"] * 3
+    assert run_stages(out, verbs, bag, number=2) == ["done"] * 3
 
 
-def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: Path) -> None:
+def test_interrupted_training_resumes_from_checkpoint(tmp_path: Path, bag: Path) -> None:
     verbs, out = Verbs(), tmp_path / "out"
     verbs.codes["train"] = 130
     with pytest.raises(KeyboardInterrupt):
-        way(out, verbs, bag)
+        run_stages(out, verbs, bag)
     (out / "run" / "checkpoints").mkdir()  # without a checkpoint it would have to begin again
     (out / "run" / "checkpoints" / "latest.safetensors").touch()
-    assert way(out, verbs, bag) == ["kept", "kept", "done"]
+    assert run_stages(out, verbs, bag) == ["kept", "kept", "done"]
     assert verbs.ran[-1] == "train-on"
     assert not (out / "earlier").exists()
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> None:
+def test_foreign_folder_is_refused(tmp_path: Path, bag: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(RestockError, match="not made by `restock start`"):
-        way(tmp_path, Verbs(), bag)
+        run_stages(tmp_path, Verbs(), bag)
 
 
-def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, shell):
+def test_dry_run_prints_commands_and_writes_nothing(tmp_path, shell):
     out, bags = tmp_path / "out", tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
     printed = shell.out("start", bags, "--out", out, "--dry-run")
@@ -102,7 +102,7 @@ def test_a_dry_run_prints_commands_and_writes_nothing(tmp_path, shell):
 
 
 @pytest.mark.parametrize("fails", one_in(2, ["eval", "judge"]))
-def test_a_failed_evaluation_does_not_end_well(tmp_path: Path, fails: str) -> None:
+def test_failed_evaluation_stops_with_remedy(tmp_path: Path, fails: str) -> None:
     class Failing(Work):
         def do(self, stage: Stage) -> Ended:
             ended = super().do(stage)
@@ -127,7 +127,7 @@ class Parked(Drive):
         return topics
 
 
-def test_a_bag_without_commands_stops_at_the_proposal(tmp_path, shell):
+def test_bag_without_commands_stops_at_proposal(tmp_path, shell):
     recording = write_bag(Parked(), tmp_path / "parked")
     out = tmp_path / "out"
     document = shell.json("start", recording, "--out", out, code=3)
@@ -145,8 +145,8 @@ class Lost(Drive):
         return {name: topics[name] for name in ("/cmd_vel", "/scan")}
 
 
-def test_commands_and_poses_in_different_recordings(tmp_path, shell):
-    """Of a Nav2 cart only the one was told as missing, though the other recording has it."""
+def test_commands_and_poses_in_separate_recordings_stop(tmp_path, shell):
+    """Regression: one input was reported missing, though the other recording has it."""
     write_bag(Lost(), tmp_path / "bags" / "commands")
     write_bag(Parked(), tmp_path / "bags" / "poses")
     document = shell.json("start", tmp_path / "bags", "--out", tmp_path / "out", code=3)
@@ -155,7 +155,7 @@ def test_commands_and_poses_in_different_recordings(tmp_path, shell):
     assert str(tmp_path / "out" / "profile.toml") in document["stopped"]["remedies"][0]
 
 
-def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, shell):
+def test_edited_profile_is_used_and_kept(tmp_path, shell):
     recording = write_bag(Drive(), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
@@ -173,8 +173,8 @@ def test_an_edited_profile_is_taken_and_never_replaced(tmp_path, shell):
     assert profile.read_text() == mine
 
 
-def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, shell):
-    """The store had half of the transitions that were told."""
+def test_copied_recording_is_not_counted_twice(tmp_path, shell):
+    """Regression: twice the transitions of the store were reported."""
     bags = tmp_path / "bags"
     recording = write_bag(Drive(), bags / "drive")
     shutil.copytree(recording, bags / "again")
@@ -190,7 +190,7 @@ def test_a_copy_of_a_recording_is_not_counted_twice(tmp_path, shell):
 
 
 @pytest.mark.long
-def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_models, shell):
+def test_policy_is_from_logs_alone_without_trusted_twin(tmp_path, quick_models, shell):
     recording = write_bag(Drive(12.0), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (recording, "--out", out, "--minutes", "0.02")
@@ -208,7 +208,7 @@ def test_without_a_trusted_twin_the_policy_is_from_logs_alone(tmp_path, quick_mo
 
 
 @pytest.mark.long
-def test_a_person_chooses_among_command_topics(tmp_path, shell):
+def test_several_command_topics_need_decision(tmp_path, shell):
     recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")
     out = tmp_path / "out"
     argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
@@ -219,23 +219,23 @@ def test_a_person_chooses_among_command_topics(tmp_path, shell):
     assert document["stages"][-1]["name"] == "mix"
 
 
-def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
-    """Of a stranger's Neato "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
+def test_single_held_out_episode_gives_no_verdict() -> None:
+    """Regression: "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
     few = "1 episode, and weights need at least 5"
     rows = [
         {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
         | {"estimator": name, "value": value, "refused": None if value else few}
         for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None))
     ]
-    (reported,) = outcomes.on_logs({"results": rows, "notes": []})
-    assert reported.startswith(
+    (outcome,) = outcomes.on_logs({"results": rows, "notes": []})
+    assert outcome.startswith(
         "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
     )
-    assert reported.endswith(f"(pdwis) refused: {few}")
+    assert outcome.endswith(f"(pdwis) refused: {few}")
 
 
-def test_a_lidar_that_sees_into_the_robot_stops_it(tmp_path, shell):
-    """A robot of 4 x 3 m in a small room went all the way to a policy."""
+def test_lidar_returns_inside_outline_stop_start(tmp_path, shell):
+    """Regression: a robot of 4 x 3 m in a small room reached a policy."""
     recording, out = write_bag(Drive(), tmp_path / "drive"), tmp_path / "out"
     argv = (recording, "--out", out, *up_to_the_panel(tmp_path))
     shell.json("start", *argv, code=3)

@@ -1,4 +1,4 @@
-"""What `restock start` takes beside recordings: damaged ones, definitions, tags, a URDF, a map."""
+"""Inputs of `restock start`: damaged recordings, definitions, tags, a URDF, a map."""
 
 from functools import partial
 from pathlib import Path
@@ -36,8 +36,8 @@ def commands(document: Any) -> dict[str, str]:
     return {stage["name"]: stage["command"] for stage in document["stages"]}
 
 
-def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, shell):
-    """And its map of another frame stops it at the floor."""
+def test_salvage_reads_intact_part_of_recording(tmp_path, shell):
+    """A map in another frame stops it at the floor stage."""
     damaged = cut_bag(tmp_path / "bags" / "damaged")
     out, hall = tmp_path / "out", tmp_path / "hall.yaml"
     Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
@@ -49,9 +49,9 @@ def test_salvage_reads_a_damaged_recording_as_far_as_intact(tmp_path, shell):
 
     tags = ("--tag", "robot=amr-7", "--tag", "site=north")
     document = shell.json("start", *argv, "--salvage", *tags, code=3)
-    said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
-    assert any(line.startswith("damaged: ") for line in said["info"])
-    assert any(line.startswith("lost: ") for line in said["ingest"])
+    outcomes = {stage["name"]: stage["outcome"] for stage in document["stages"]}
+    assert any(line.startswith("damaged: ") for line in outcomes["info"])
+    assert any(line.startswith("lost: ") for line in outcomes["ingest"])
     for name in ("info", "propose", "check", "ingest"):
         assert "--salvage" in commands(document)[name]
     assert "--salvage --tag robot=amr-7 --tag site=north" in commands(document)["ingest"]
@@ -78,7 +78,7 @@ WHEEL = """<link name='{0}'><collision><geometry><cylinder radius='0.09' length=
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, shell):
+def test_custom_urdf_and_map_reach_report(tmp_path, shell):
     urdf, hall, out = tmp_path / "cart.urdf", tmp_path / "hall.yaml", tmp_path / "out"
     urdf.write_text(CART.format(WHEEL.format("left", 0.22) + WHEEL.format("right", -0.22)))
     Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
@@ -89,13 +89,13 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, shell):
     argv = (bag, "--out", out, "--urdf", urdf, "--map", hall)
     document = shell.json("start", *argv, "--minutes", "0.1")
     assert Path(document["report"]).is_file()
-    said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
-    assert said["floor"][0].startswith(f"made from {hall}: 15 x 4 m")
+    outcomes = {stage["name"]: stage["outcome"] for stage in document["stages"]}
+    assert outcomes["floor"][0].startswith(f"made from {hall}: 15 x 4 m")
     robot = load_profile(str(out / "profile.toml")).robot
     assert robot is not None
     assert (robot.wheel_radius_m, robot.track_m, robot.mass_kg) == (0.09, 0.44, 20.0)
     assert robot.origin_of("track_m") == "urdf"
-    # Once the profile is a person's, a proposal's flags are said to change nothing.
+    # Once the profile is edited, options of the proposal are reported to have no effect.
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
     assert "--urdf can only change a proposal" in shell.out(
         "start", *argv, *up_to_the_panel(tmp_path), code=3
@@ -103,7 +103,7 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(tmp_path, shell):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_robots_own_types_are_read_by_their_definitions(tmp_path) -> None:
+def test_custom_message_types_are_read_by_definitions(tmp_path) -> None:
     """A bumper of an unknown type is proposed once its definition is there."""
     message = tmp_path / "definitions" / "neato2_interfaces" / "msg" / "Bump.msg"
     message.parent.mkdir(parents=True)
@@ -125,28 +125,28 @@ def test_a_robots_own_types_are_read_by_their_definitions(tmp_path) -> None:
     assert "--definitions" in recording["topics"]["/accel"]["skipped"]
 
 
-def test_what_is_no_recording_is_refused_and_nothing_is_written(tmp_path, monkeypatch, shell):
+def test_invalid_recordings_are_refused_before_writing(tmp_path, monkeypatch, shell):
     monkeypatch.chdir(tmp_path)
     Path("text.mcap").write_text("text\n")
     Path("bags").mkdir()
     Path("bags", "empty.mcap").touch()
     Path("bare").mkdir()
     Path("bare", "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n")
-    for paths, said in {
+    for paths, message in {
         ("nothing",): "restock: nothing: no such file or folder",
         ("text.mcap",): "restock: text.mcap: not a recording: neither an MCAP,",
         ("bags",): "restock: bags/empty.mcap: an empty file",
         ("bare",): "restock: bare: a bag without its storage files",
     }.items():
         out, err = shell.printed("start", *paths, "--out", "out", code=2)
-        assert err.startswith(said)
+        assert err.startswith(message)
         assert out == ""
         assert not Path("out").exists()
 
 
 @pytest.mark.long
-def test_unread_recordings_are_sorted_by_kind_too(tmp_path, monkeypatch, shell):
-    """The small drive of another robot was ingested with the others."""
+def test_unread_recordings_are_grouped_by_robot(tmp_path, monkeypatch, shell):
+    """Regression: the small drive of another robot was ingested with the others."""
     monkeypatch.setattr(drives, "drives_by_kind", partial(drives.drives_by_kind, most=2))
     bags, out = tmp_path / "bags", tmp_path / "out"
     for name, seconds in (("a", 9.0), ("b", 4.0), ("c", 8.0)):
@@ -173,13 +173,13 @@ class OtherLidar(Drive):
         return super().topics() | {"/scan": columns(tenth, scans(np.full((len(tenth), 36), 3.0)))}
 
 
-def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> None:
-    """Training of the Burgers in the twin ended with the rule "success" needs success."""
+def test_task_without_goal_has_no_practice_by_success(tmp_path: Path) -> None:
+    """Regression: training ended with the error that the rule "success" needs success."""
     file = tmp_path / "p.toml"
     for goal in ("route", "none"):
         file.write_text(WAREHOUSE.replace('goal = "route"', f'goal = "{goal}"'))
         requested = StartCommand(("bag",), tmp_path / "out", profile=str(file), twin="yes")
-        way = Way(requested, Verbs(tmp_path / "out", cli.main, lambda line: None))
+        way = Way(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
         assert way._twin() is not None
         assert ("practice.rule=success" in way.to.train) == (goal == "route")
 
@@ -194,7 +194,7 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
         ("--urdf", "box.urdf", "'box' has no wheels"),
     ],
 )
-def test_wrong_options_are_refused_before_the_first_stage(
+def test_invalid_options_are_refused_before_first_stage(
     tmp_path, monkeypatch, shell, option, value, why
 ):
     monkeypatch.chdir(tmp_path)
@@ -206,7 +206,7 @@ def test_wrong_options_are_refused_before_the_first_stage(
 
 
 @pytest.mark.parametrize("lidar", [True, False])
-def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(tmp_path, lidar):
+def test_robot_without_lidar_has_no_blocked_aisles(tmp_path, lidar):
     profile = tmp_path / "robot.toml"
     text = profile_toml(load_profile("turtlebot3"))
     if not lidar:
@@ -216,7 +216,7 @@ def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(tmp_path, lidar
     assert load_profile(profile).task.lidar is lidar
     driven = [kind for kind in DEFAULT_CONDITIONS if lidar or kind != "blocked_aisle"]
     requested = StartCommand(("bag",), tmp_path / "out", profile=str(profile), twin="yes")
-    way = Way(requested, Verbs(tmp_path / "out", cli.main, lambda line: None))
+    way = Way(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
     assert way._twin() is not None
     assert way.to.kinds == (() if lidar else tuple(driven))  # none: all
     conditions = [one for one in way.to.train if one.startswith("env.conditions")]
@@ -224,14 +224,14 @@ def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(tmp_path, lidar
     assert not any("blocked_aisle" in one for one in conditions)
 
 
-class Verbs(Work):
-    """Stands in for the verbs: the floor has room for everything, and the fit is good."""
+class GoodStages(Work):
+    """Fake stages: the floor has room for every mission, and the fit is good."""
 
     def do(self, stage: Stage) -> Ended:
         return Ended(stage.name, "", "done", document={"episodes": list(DEFAULT_CONDITIONS)})
 
 
-def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
+def test_few_rows_leave_draws_for_twin() -> None:
     few = {"rows": 267, "max_replays_per_row": 400.0}
     allowed = 267 * 400 / 128  # updates
     settings = dict(one.split("=") for one in updates_settings(few, 1.0, twin=True, seconds=30.0))

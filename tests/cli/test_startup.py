@@ -1,4 +1,4 @@
-"""Starting up: a command imports what it uses, and none of what only other commands need."""
+"""Startup: a command imports only what it uses."""
 
 import json
 import os
@@ -12,8 +12,8 @@ from support.stores import one
 
 from restock.ingest.store.writer import StoreWriter
 
-OF_LEARNING = {"torch", "mujoco", "gymnasium", "scipy", "altair", "tensorboard", "onnxruntime"}
-SLOW = OF_LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosbags", "ruamel.yaml"}
+LEARNING = {"torch", "mujoco", "gymnasium", "scipy", "altair", "tensorboard", "onnxruntime"}
+SLOW = LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosbags", "ruamel.yaml"}
 
 
 def loaded(*args: str, codes: tuple[int, ...] = (0, 1)) -> set[str]:
@@ -27,7 +27,7 @@ def loaded(*args: str, codes: tuple[int, ...] = (0, 1)) -> set[str]:
     return set(json.loads(done.stderr.splitlines()[-1]))
 
 
-def test_help_imports_no_library_at_all() -> None:
+def test_help_imports_no_library() -> None:
     modules = loaded("--help")
     used = SLOW | {"numpy", "pyarrow", "duckdb", "deltalake", "msgspec", "tyro", "rich"}
     assert modules & used == set()
@@ -41,25 +41,25 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_query_imports_no_learning_and_no_readers(store: Path) -> None:
+def test_query_imports_no_learning_or_readers(store: Path) -> None:
     modules = loaded("sql", str(store), "FROM coverage, transitions LIMIT 9", "--json")
     assert modules & (SLOW | {"pyarrow.compute", "rich", "tyro"}) == set()
     assert "duckdb" in modules
 
 
-def test_an_audit_imports_no_learning_and_no_readers(store: Path) -> None:
+def test_audit_imports_no_learning_or_readers(store: Path) -> None:
     unused = {"restock.replay.panel.build", "restock.replay.fleet.gaps"}
     assert loaded("audit", str(store)) & (SLOW | unused) == set()
 
 
-def test_a_review_imports_no_learning_and_no_charts(store: Path, tmp_path: Path) -> None:
+def test_review_imports_no_learning_or_charts(store: Path, tmp_path: Path) -> None:
     modules = loaded("review", str(store), "--out", str(tmp_path / "review.csv"))
-    assert modules & (OF_LEARNING | {"vl_convert"}) == set()
+    assert modules & (LEARNING | {"vl_convert"}) == set()
 
 
-def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
+def test_ingest_imports_no_learning_or_pandas(tmp_path: Path) -> None:
     command = ("ingest", str(write_bag(Drive(), tmp_path / "bag")), "--store", str(tmp_path / "s"))
-    assert loaded(*command, "--json") & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
+    assert loaded(*command, "--json") & (LEARNING | {"pandas", "pyarrow.dataset"}) == set()
     assert loaded(*command) & {"asyncio", "duckdb", "pyarrow.compute", "tyro"} == set()
 
 
@@ -87,7 +87,7 @@ def test_missing_paths_are_reported_before_heavy_imports(command, unused, tmp_pa
         ("restock.train.loop", set()),
     ],
 )
-def test_what_few_runs_use_is_not_imported_by_all(module: str, slow: set[str]) -> None:
+def test_rarely_used_libraries_are_not_imported(module: str, slow: set[str]) -> None:
     """scipy.signal takes .6 s, scipy.stats .3 s and PyTorch more than 1 s."""
     code = f"import sys, {module}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -95,14 +95,14 @@ def test_what_few_runs_use_is_not_imported_by_all(module: str, slow: set[str]) -
 
 
 @pytest.mark.parametrize("order", ["import restock, gymnasium", "import gymnasium, restock"])
-def test_the_environment_is_registered_in_either_order(order: str) -> None:
+def test_environment_is_registered_in_either_order(order: str) -> None:
     code = f"{order}; print(gymnasium.spec('restock/Warehouse-v0').entry_point)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "restock.train.twin.env.vector_env:WarehouseEnv", done.stderr
 
 
-def test_pandas_works_once_it_is_imported() -> None:
-    """Stable-Baselines3 imports it; Arrow must still make its frames."""
+def test_pandas_works_if_imported_later() -> None:
+    """Stable-Baselines3 imports pandas; Arrow must still create data frames."""
     pytest.importorskip("pandas")
     code = (
         "from restock.cli import _settle_pandas; import sys, pyarrow as pa; _settle_pandas();"
@@ -118,7 +118,7 @@ def test_pandas_works_once_it_is_imported() -> None:
     ("verb", "environment", "threads"),
     [("audit", {}, "1"), ("audit", {"OPENBLAS_NUM_THREADS": "3"}, "3"), ("train", {}, "")],
 )
-def test_a_short_command_starts_no_threads_of_blas(verb, environment, threads):
+def test_short_commands_start_no_blas_threads(verb, environment, threads):
     code = (
         "import os, sys; from restock.cli import main; main(sys.argv[1:]);"
         "sys.stderr.write(os.environ.get('OPENBLAS_NUM_THREADS', ''))"

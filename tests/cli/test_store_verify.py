@@ -1,4 +1,4 @@
-"""Bytes of a store that changed are found before rows are taken from it, and by `store verify`."""
+"""Changed bytes of a store are found before its rows are used, and by `store verify`."""
 
 import os
 import random
@@ -40,8 +40,8 @@ def flip(file: Path, at: int, bit: int = 0) -> None:
     file.write_bytes(content)
 
 
-def damaged(store: Store) -> bool:
-    """Whether `verify` refuses it."""
+def is_damaged(store: Store) -> bool:
+    """Return whether `verify` refuses the store."""
     with suppress(StoreError):
         store.verify()
         return False
@@ -52,8 +52,8 @@ def rows_file(store: Path) -> Path:
     return next(store.glob("transitions/compacted/*.parquet"))
 
 
-def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
-    """Of a page's header no checksum is kept: some of its bits mean nothing to who reads values."""
+def test_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
+    """Page headers have no checksum, and some of their bits do not affect values."""
     file, draw = rows_file(store), random.Random(5)
     with Store(store) as opened:
         rows = opened.sql("FROM transitions ORDER BY ALL").to_arrow_table()
@@ -63,7 +63,7 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
     for _ in range(FLIPS):
         flip(file, draw.randrange(4, len(content) - footer - 8), draw.randrange(8))
         with Store(store) as opened:
-            if damaged(opened):
+            if is_damaged(opened):
                 found += 1
             else:
                 assert opened.sql("FROM transitions ORDER BY ALL").to_arrow_table() == rows
@@ -84,45 +84,45 @@ def test_verbs_refuse_damaged_rows(verb, store, tmp_path, shell):
     file, out = rows_file(store), tmp_path / "out.parquet"
     flip(file, 1000)
     argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]
-    said = shell.err(*argv)
-    assert f"its file {file.relative_to(store)} cannot be read" in said
-    assert "--drop-damaged" in said
+    err = shell.err(*argv)
+    assert f"its file {file.relative_to(store)} cannot be read" in err
+    assert "--drop-damaged" in err
     assert not out.exists()
 
 
-def test_verify_lists_what_is_damaged(store: Path, shell: Shell) -> None:
+def test_verify_lists_damaged_files(store: Path, shell: Shell) -> None:
     assert "2 of 2 files whole" in shell.err("store", "verify", store, code=0)
     file, gone = rows_file(store), next(store.glob("recordings/compacted/*.parquet"))
     flip(file, 1000)
     gone.unlink()
-    reported = shell.json("store", "verify", store, code=1)
-    assert reported["files"] == 2
-    assert [one["file"] for one in reported["damaged"]] == [
+    document = shell.json("store", "verify", store, code=1)
+    assert document["files"] == 2
+    assert [one["file"] for one in document["damaged"]] == [
         str(one.relative_to(store)) for one in (file, gone)
     ]
 
 
-def test_a_damaged_manifest_is_found_in_an_unreadable_store(store: Path) -> None:
+def test_damaged_manifest_is_found_in_unreadable_store(store: Path) -> None:
     file = next(store.glob("recordings/compacted/*.parquet"))
     flip(file, 1000)
     assert [Path(one.file).name for one in verify_store(store).damaged] == [file.name]
 
 
-def test_an_unchanged_file_is_verified_once(store: Path) -> None:
+def test_unchanged_file_is_verified_once(store: Path) -> None:
     file = rows_file(store)
     with Store(store) as opened:
         assert opened.unverified() == 2
         opened.verify()
         assert opened.unverified() == 0
-        reported = file.stat()
+        stat = file.stat()
         flip(file, 1000)
-        os.utime(file, ns=(reported.st_atime_ns, reported.st_mtime_ns))
+        os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         opened.verify()  # remembered, as the file seems unchanged
         assert len(verify_store(store).damaged) == 1  # which reads every file
         assert opened.unverified() == 1
         with pytest.raises(StoreError, match="cannot be read"):
             opened.verify()
-        assert opened.unverified() == 1  # what was found whole before is still remembered
+        assert opened.unverified() == 1  # files that were whole are still remembered
         flip(file, 1000)
         opened.verify()
         assert opened.unverified() == 0

@@ -1,4 +1,4 @@
-"""Where what is printed cannot be shown, stored or read, the work is done all the same."""
+"""Verbs complete their work even if their output cannot be shown, stored or read."""
 
 import json
 import os
@@ -31,17 +31,17 @@ def recordings(store: Path) -> int:
         return int(opened.sql("SELECT count(*) FROM recordings").fetchall()[0][0])
 
 
-def test_a_reader_that_goes_away_does_not_end_an_ingest(bags: Path, tmp_path: Path) -> None:
+def test_closed_pipe_does_not_stop_ingest(bags: Path, tmp_path: Path) -> None:
     read_end, write_end = os.pipe()
     os.close(read_end)
-    with os.fdopen(write_end, "wb") as gone:
-        done = ingested(bags, tmp_path / "store", gone)
+    with os.fdopen(write_end, "wb") as closed:
+        done = ingested(bags, tmp_path / "store", closed)
     assert (done.returncode, done.stderr) == (0, "")
     assert recordings(tmp_path / "store") == 3
 
 
 @pytest.mark.skipif(not FULL_DISK.exists(), reason="no /dev/full here")
-def test_a_full_disk_behind_stdout_is_said_when_all_is_ingested(bags: Path, tmp_path: Path) -> None:
+def test_full_disk_for_stdout_is_reported_after_ingest(bags: Path, tmp_path: Path) -> None:
     with FULL_DISK.open("wb") as full:
         done = ingested(bags, tmp_path / "store", full)
     assert done.returncode == 2
@@ -50,18 +50,18 @@ def test_a_full_disk_behind_stdout_is_said_when_all_is_ingested(bags: Path, tmp_
 
 
 @pytest.mark.long
-def test_what_an_encoding_lacks_is_substituted(bags: Path, tmp_path: Path) -> None:
+def test_unencodable_characters_are_replaced(bags: Path, tmp_path: Path) -> None:
     store = str(tmp_path / "store")
     latin = os.environ | {"PYTHONIOENCODING": "ascii"}
 
-    def said(*words: str) -> str:
+    def output_of(*words: str) -> str:
         command = [sys.executable, "-m", "restock", *words]
         done = subprocess.run(command, env=latin, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout.decode("ascii")
 
-    assert " topic " in said("ingest", str(bags), "--store", store, "--verbose")
+    assert " topic " in output_of("ingest", str(bags), "--store", store, "--verbose")
     assert recordings(tmp_path / "store") == 3
-    assert "------" in said("coverage", store)
-    (row,) = json.loads(said("sql", store, "SELECT 'ä─𝄞' AS text", "--json"))
+    assert "------" in output_of("coverage", store)
+    (row,) = json.loads(output_of("sql", store, "SELECT 'ä─𝄞' AS text", "--json"))
     assert row == {"text": "ä-𝄞"}

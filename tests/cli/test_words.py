@@ -1,4 +1,4 @@
-"""Plain command lines are parsed without tyro: what comes out is what tyro makes of them."""
+"""Plain command lines are parsed without tyro, with the same result."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ WORDS = ("a", "store/b", "7", "0.5", "-3", "None", "", "-", "--", "new", "cpu", 
 
 @st.composite
 def lines(draw: st.DrawFn) -> tuple[type[Any], list[str]]:
-    """Draw a command and words: some in its places, then options and values that may fit."""
+    """Draw a command and words: positional arguments, then options and values that may fit."""
     command = draw(st.sampled_from(COMMANDS))
     names = [field.name.replace("_", "-") for field in dataclasses.fields(command)]
     option, word = st.sampled_from([f"--{name}" for name in names]), st.sampled_from(WORDS)
@@ -37,7 +37,7 @@ def lines(draw: st.DrawFn) -> tuple[type[Any], list[str]]:
 
 @settings(max_examples=200, deadline=None)
 @given(lines())
-def test_a_plain_line_is_what_tyro_makes_of_it(line: tuple[type[Any], list[str]]) -> None:
+def test_plain_lines_are_parsed_as_by_tyro(line: tuple[type[Any], list[str]]) -> None:
     command, words = line
     plain = parse_plain(command, words)
     event("plain" if plain else "left to tyro")

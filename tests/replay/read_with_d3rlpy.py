@@ -7,7 +7,7 @@ import d3rlpy
 
 
 def read(path: str) -> dict[str, object]:
-    """Return what the file has, once a learner has trained on it."""
+    """Train a learner on the file and return its episodes."""
     with open(path, "rb") as file:  # noqa: PTH123 - as d3rlpy's documentation does it
         dataset = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
     discrete = dataset.dataset_info.action_space == d3rlpy.constants.ActionSpace.DISCRETE

@@ -15,7 +15,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 
 
 class Absent(types.ModuleType):
-    """Stands for torchvision, which only transforms pictures, where it cannot load."""
+    """Stub for torchvision, which only transforms images here, if it cannot be loaded."""
 
     __path__: ClassVar[list[str]] = []
 
@@ -26,7 +26,7 @@ class Absent(types.ModuleType):
 
 
 class ToTensor:
-    """torchvision's: a picture as (C, H, W), from 0 to 1."""
+    """Stub for torchvision's ToTensor: an image as (C, H, W), scaled to 0..1."""
 
     def __call__(self, picture: "PIL.Image.Image") -> "torch.Tensor":
         values = torch.from_numpy(np.array(picture))

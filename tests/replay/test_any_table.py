@@ -1,4 +1,4 @@
-"""Panels of a table of any task: no robot, no store, only its transitions."""
+"""Panels built from a plain table of transitions, here of CartPole: no robot, no store."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,31 +20,31 @@ UNCORRECTED = 'correction = {pre = "none", post = "none"}\n'
 QUOTAS = f"{UNCORRECTED}{NO_SPLIT}[[strata]]\nname = 'rare'\nshare = 0.3\n[each_condition]\n"
 
 
-def logged(episodes: int = 40, limit: int = 30) -> Rows:
-    """Log CartPole under random actions; an episode that begins tilted is rare."""
+def cartpole_rows(episodes: int = 40, limit: int = 30) -> Rows:
+    """Return CartPole rows under random actions; episodes that begin tilted are labelled rare."""
     env, rng, rows = gym.make("CartPole-v1", max_episode_steps=limit), np.random.default_rng(0), []
     for episode in range(episodes):
-        seen, _ = env.reset(seed=episode)
-        over, condition = False, "nominal" if abs(seen[2]) < 0.04 else "rare"
-        while not over:
+        before, _ = env.reset(seed=episode)
+        done, condition = False, "nominal" if abs(before[2]) < 0.04 else "rare"
+        while not done:
             action = int(rng.integers(2))
             after, reward, terminated, truncated, _ = env.step(action)
-            row = {"observation": seen, "action": action, "reward": reward, "episode": episode}
+            row = {"observation": before, "action": action, "reward": reward, "episode": episode}
             row |= {"terminated": terminated, "truncated": truncated, "condition": condition}
-            rows.append(row | {"after": after, "speed": float(seen[1])})
-            seen, over = after, terminated or truncated
+            rows.append(row | {"after": after, "speed": float(before[1])})
+            before, done = after, terminated or truncated
     return rows
 
 
-ROWS = logged()
+ROWS = cartpole_rows()
 
 
 def table(rows: Rows = ROWS, *without: str, after: str = "after") -> pa.Table:
-    named = pa.Table.from_pylist(rows).drop_columns(list(without))
-    return named.rename_columns([after if name == "after" else name for name in named.column_names])
+    plain = pa.Table.from_pylist(rows).drop_columns(list(without))
+    return plain.rename_columns([after if name == "after" else name for name in plain.column_names])
 
 
-def test_a_panel_has_the_rows_of_the_table(tmp_path: Path) -> None:
+def test_panel_holds_table_rows(tmp_path: Path) -> None:
     panel = panel_of(table(after="next_observation"), f"n_step = 1\n{QUOTAS}", tmp_path / "p")
     part, order = panel.columns, panel.meta["transition_id"].to_numpy()
     for name, of in (("observation", "observation"), ("next_observation", "after")):
@@ -56,8 +56,8 @@ def test_a_panel_has_the_rows_of_the_table(tmp_path: Path) -> None:
     assert len(panel) == len(ROWS)
 
 
-def test_next_observations_come_from_the_next_row(tmp_path: Path) -> None:
-    """The last row of an episode that did not terminate has none: it is counted."""
+def test_missing_next_observation_is_read_from_next_row(tmp_path: Path) -> None:
+    """The last row of a truncated episode has no next row: it is left out and counted."""
     panel = panel_of(table(ROWS, "after"), QUOTAS, tmp_path / "p")
     given = panel_of(table(after="next_observation"), QUOTAS, tmp_path / "given")
     lost = sum(row["truncated"] and not row["terminated"] for row in ROWS)
@@ -68,7 +68,7 @@ def test_next_observations_come_from_the_next_row(tmp_path: Path) -> None:
     np.testing.assert_array_equal(panel.rows[bootstraps], given.rows[kept][bootstraps])
 
 
-def test_rows_in_another_order_are_the_same_episodes(tmp_path: Path) -> None:
+def test_row_order_does_not_change_panel(tmp_path: Path) -> None:
     places: dict[int, int] = {}
     steps = []
     for number, row in enumerate(ROWS):
@@ -82,19 +82,19 @@ def test_rows_in_another_order_are_the_same_episodes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(in_order.rows, shuffled.rows)
 
 
-def test_a_file_is_mixed_as_a_table_is(tmp_path: Path, shell: Shell) -> None:
+def test_parquet_file_is_mixed_like_table(tmp_path: Path, shell: Shell) -> None:
     pq.write_table(table(ROWS, "after"), tmp_path / "log.parquet")
     (tmp_path / "mixture.toml").write_text(QUOTAS)
     options = ["--mixture", str(tmp_path / "mixture.toml"), "--out", str(tmp_path / "cli")]
     assert "rows of the table" in shell.out("mix", tmp_path / "log.parquet", *options)
     panel = panel_of(table(ROWS, "after"), QUOTAS, tmp_path / "p")
     assert Panel.open(tmp_path / "cli").id == panel.id
-    other = [{**row, "reward": 2.0} for row in ROWS]  # a table's content is in the id
+    other = [{**row, "reward": 2.0} for row in ROWS]  # the id depends on the content
     assert panel_of(table(other, "after"), QUOTAS, tmp_path / "o").id != panel.id
 
 
-def test_every_batch_has_its_quotas(tmp_path: Path) -> None:
-    """By the condition, or by SQL over any column of the table."""
+def test_batches_meet_quotas(tmp_path: Path) -> None:
+    """Strata are chosen by condition, or by SQL over any column of the table."""
     fast = QUOTAS.replace("name = 'rare'", "name = 'fast'\nwhere = \"speed > 0.5\"")
     for name, text in (("rare", QUOTAS), ("fast", fast)):
         panel = panel_of(table(ROWS, "after"), text, tmp_path / name)
@@ -108,7 +108,7 @@ def test_every_batch_has_its_quotas(tmp_path: Path) -> None:
         assert name == "rare" or (drawn[:, 1] > 0.5).all()
 
 
-def changed(number: int, **values: Any) -> Callable[[], pa.Table]:
+def change_row(number: int, **values: Any) -> Callable[[], pa.Table]:
     rows = [*ROWS]
     rows[number] = {**rows[number], **values}
     return lambda: table(rows, "after")
@@ -119,18 +119,21 @@ HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("make_table", "message"),
     [
         (lambda: table(ROWS, "terminated", "truncated"), "it has no terminated, truncated"),
         (lambda: table(ROWS, "condition"), "it has no condition"),
         (lambda: table(OPEN, "after"), "no row ends an episode"),
-        (changed(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
-        (changed(0, next_observation=[1.0]), "next observation of row 0 does not have 4 entries"),
-        (changed(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
+        (change_row(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
+        (
+            change_row(0, next_observation=[1.0]),
+            "next observation of row 0 does not have 4 entries",
+        ),
+        (change_row(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
         (lambda: table(HALVES, "after"), "is not a whole number from 0 to 32,767"),
-        (changed(5, action=-1), "the action of row 5 is not a whole number"),
-        (changed(4, truncated=True), "row 5 follows the end of its episode"),
-        (changed(6, condition=None), "1 rows have no coverage label"),
+        (change_row(5, action=-1), "the action of row 5 is not a whole number"),
+        (change_row(4, truncated=True), "row 5 follows the end of its episode"),
+        (change_row(6, condition=None), "1 rows have no coverage label"),
         (lambda: table([{**row, "condition": 1} for row in ROWS]), "condition must be text"),
         (
             lambda: table([{**row, "condition": "nominal"} for row in ROWS]),
@@ -138,9 +141,9 @@ HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
         ),
     ],
 )
-def test_tables_that_contradict_themselves_are_refused(
-    tmp_path: Path, given: Callable[[], pa.Table], said: str
+def test_invalid_tables_are_refused(
+    tmp_path: Path, make_table: Callable[[], pa.Table], message: str
 ) -> None:
-    with pytest.raises(RestockError, match=said):
-        panel_of(given(), QUOTAS, tmp_path / "panel")
+    with pytest.raises(RestockError, match=message):
+        panel_of(make_table(), QUOTAS, tmp_path / "panel")
     assert not list(tmp_path.iterdir())

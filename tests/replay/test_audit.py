@@ -1,4 +1,4 @@
-"""Each audit finds the fault planted for it, and nothing in data without it."""
+"""Each audit finds the fault planted for it, and nothing in clean data."""
 
 import json
 import re
@@ -42,18 +42,18 @@ TABLE = re.compile(r"\b(FROM|INTO|UPDATE) (transitions|recordings)\b")  # named 
 
 @pytest.fixture(scope="module")
 def clean() -> Tables:
-    """Enough recent data of every condition that only the two logs' infos have anything to say."""
+    """Return recent data of every condition, on which all audits but those of NOT_CLEAN pass."""
     tables = [recording_transitions(index, episodes=120) for index in (1, 2)]
     recordings = pa.concat_tables([manifest(table) for table in tables])
     table = pa.concat_tables(tables)
-    # Of one week: where the data begins in one and ends in the next, drift compares the two.
+    # All rows are of one week: drift would compare two weeks.
     now = datetime.now(UTC)
     monday = (now - timedelta(days=now.weekday() + 7)).replace(hour=0, minute=0, second=0)
     recent = int(monday.timestamp()) * 10**9 + 10**14
     return replaced(table, {"stamp_ns": table["stamp_ns"].to_numpy() % 10**13 + recent}), recordings
 
 
-FAULTS = [  # audit, rows that it finds, part of the first of them, SQL that plants the fault
+FAULTS = [  # audit, number of rows found, part of the first row, SQL that plants the fault
     (name, int(rows), json.loads(first), sql)
     for name, rows, first, sql in re.findall(
         r"^-- (\w+) (\d+) ({[^\n]*})(.+?)(?=^-- \w+ \d|\Z)",
@@ -63,8 +63,10 @@ FAULTS = [  # audit, rows that it finds, part of the first of them, SQL that pla
 ]
 
 
-def found(tables: Tables, names: list[str], sql: str = "", **stricter: float) -> list[Finding]:
-    """Return what audits find, once statements have changed the tables."""
+def findings_of(
+    tables: Tables, names: list[str], sql: str = "", **stricter: float
+) -> list[Finding]:
+    """Return the findings of audits after `sql` has changed the tables."""
     thresholds = load_thresholds()
     chosen = {n: thresholds[n] | stricter for n in names if AUDITS[n].parameters}
     with duckdb.connect() as connection:
@@ -75,43 +77,41 @@ def found(tables: Tables, names: list[str], sql: str = "", **stricter: float) ->
 
 @pytest.fixture(scope="module")
 def statuses(clean: Tables) -> dict[str, str]:
-    """Return what every audit of a store alone says of the clean one."""
+    """Return the status on clean data of every audit that needs only a store."""
     alone = [audit.name for audit in AUDITS.values() if audit.needs is None]
-    return {one.audit.name: one.status for one in found(clean, alone)}
+    return {one.audit.name: one.status for one in findings_of(clean, alone)}
 
 
-STRICTER = {  # there is little of the stand-in data
+STRICTER = {  # thresholds that suit the small synthetic data
     "stratum_of_failures": {"min_success_share": 0.01},
     "thin_perturbation": {"min_rows": 1},
 }
-# The random residuals of the stand-in data are far, its recordings of one time, and it has no
+# In the synthetic data action residuals are random, recordings overlap in time, and there are no
 # action probabilities.
 NOT_CLEAN = {"far_actions", "overlapping_recordings", "no_action_probability"}
-# test_reward_audit, test_exposure_strata and test_compaction plant these.
+# faults that test_reward_audit, test_exposure_strata and test_compaction plant
 ELSEWHERE = {"reward_undetermined", "chosen_on_outcome", "many_small_files"}
 
 
 @pytest.mark.parametrize(
     ("name", "rows", "first", "sql"), FAULTS, ids=[name for name, *_ in FAULTS]
 )
-def test_each_audit_finds_its_planted_fault_and_nothing_else(
-    clean, statuses, name, rows, first, sql
-):
+def test_audit_finds_planted_fault(clean, statuses, name, rows, first, sql):
     assert statuses[name] == "pass" or name in NOT_CLEAN
-    (finding,) = found(clean, [name], sql, **STRICTER.get(name, {}))
+    (finding,) = findings_of(clean, [name], sql, **STRICTER.get(name, {}))
     assert finding.rows == rows
     expected = {"error": "fail", "warning": "warn", "info": "info"}[AUDITS[name].severity]
     assert finding.status == expected
     assert first.items() <= finding.sample[0].items()
 
 
-def test_every_shipped_audit_of_a_store_has_a_planted_fault():
+def test_every_store_audit_has_planted_fault():
     alone = {name for name, audit in AUDITS.items() if audit.needs is None}
     assert {name for name, *_ in FAULTS} | ELSEWHERE == alone
 
 
-def beside(store: Path, name: str, spoil: str = "SELECT 1", **places: Path) -> Finding:
-    """Return what an audit finds of a panel or a run, one of whose tables was spoilt."""
+def finding_on(store: Path, name: str, spoil: str = "SELECT 1", **places: Path) -> Finding:
+    """Return an audit's finding on a panel or run after the SQL `spoil` has changed its tables."""
     chosen = {name: load_thresholds()[name]} if AUDITS[name].parameters else {}
     with open_place(store, beside=places) as connection:
         install_named(connection, spoil)
@@ -119,8 +119,8 @@ def beside(store: Path, name: str, spoil: str = "SELECT 1", **places: Path) -> F
         return run_audits(connection, [AUDITS[name]], chosen, beside=[*places])[0]
 
 
-def run_with(path: Path, **tables: list[dict[str, Any]]) -> Path:
-    """Return a run directory as far as audits look at it."""
+def write_run(path: Path, **tables: list[dict[str, Any]]) -> Path:
+    """Write the parts of a run directory that audits read."""
     path.mkdir(exist_ok=True)
     (path / "config.json").write_text("{}")
     for name, rows in tables.items():
@@ -128,9 +128,9 @@ def run_with(path: Path, **tables: list[dict[str, Any]]) -> Path:
     return path
 
 
-def test_an_evaluation_full_of_easy_episodes_is_biased(tmp_path):
-    # The logs are about nominal and blocked episodes in equal parts; the evaluation is nine parts
-    # nominal, where the policy succeeds. Only the last evaluation counts.
+def test_bias_of_easy_evaluation_is_found(tmp_path):
+    # Half of the logged episodes are nominal, but nine tenths of those evaluated, and the policy
+    # succeeds in these. Only the last evaluation counts.
     table = recording_transitions(1, episodes=40)
     truth = np.where(table["episode_index"].to_numpy() % 2 == 0, "nominal", "blocked_aisle")
     store = write_store(tmp_path / "store", [replaced(table, {"true_condition": truth.tolist()})])
@@ -139,19 +139,19 @@ def test_an_evaluation_full_of_easy_episodes_is_biased(tmp_path):
         for steps in (100, 200)
         for condition in ["nominal"] * (9 if steps == 200 else 1) + ["blocked_aisle"]
     ]
-    biased = beside(store, "evaluation_bias", run=run_with(tmp_path / "run", evaluations=rows))
+    biased = finding_on(store, "evaluation_bias", run=write_run(tmp_path / "run", evaluations=rows))
     expected = {"share": 0.9, "share_in_logs": 0.5, "success_share": 1.0}
     assert biased.sample == [{"condition": "nominal"} | expected]
-    assert beside(store, "evaluation_bias").status == "skipped"
-    # Where the policy does as well everywhere, more of one condition biases nothing.
+    assert finding_on(store, "evaluation_bias").status == "skipped"
+    # If the policy succeeds everywhere, the share of a condition biases nothing.
     rows = [row | {"success": True} for row in rows]
-    run = run_with(tmp_path / "run", evaluations=rows)
-    assert beside(store, "evaluation_bias", run=run).rows == 0
+    run = write_run(tmp_path / "run", evaluations=rows)
+    assert finding_on(store, "evaluation_bias", run=run).rows == 0
 
 
 @pytest.fixture(scope="module")
 def panels(store_path, tmp_path_factory) -> dict[str, Path]:
-    """Return a panel of the store for each way of holding out."""
+    """Return one panel of the store per kind of evaluation split."""
     folder = tmp_path_factory.mktemp("panels")
     text = (
         "evaluation_split = {{by = '{}'}}\nplanned_draws = 6400\n"
@@ -163,14 +163,14 @@ def panels(store_path, tmp_path_factory) -> dict[str, Path]:
     }
 
 
-def test_strata_that_the_panel_overrepresents_are_named(store_path, panels):
-    finding = beside(store_path, "panel_bias", panel=panels["episode"])
+def test_overrepresented_strata_are_found(store_path, panels):
+    finding = finding_on(store_path, "panel_bias", panel=panels["episode"])
     boosted = {row["stratum"] for row in finding.sample}
     assert boosted == {"wheel_slip", "blocked_aisle", "near_collision", "recovery"}
 
 
 ELSEWHERE_BUT = "SELECT * REPLACE ('elsewhere' AS episode_id) FROM panel.rows "
-LEAKS = {  # split by -> the leak, and the row that is held out although it is in the panel
+LEAKS = {  # split -> leak reported, SQL of a row that is held out although it is in the panel
     "episode": ("the same episode", "SELECT * FROM panel.rows LIMIT 1"),
     "recording": ("a recording that is held out", ELSEWHERE_BUT + "LIMIT 1"),
     "time": ("later than what is held out", ELSEWHERE_BUT + "ORDER BY logged_ns LIMIT 1"),
@@ -179,54 +179,56 @@ HELD_OUT = "CREATE OR REPLACE VIEW panel.evaluation_split AS SELECT *, '{}' AS s
 
 
 @pytest.mark.parametrize("by", LEAKS)
-def test_what_leaks_from_held_out_data_is_found(store_path, panels, by):
+def test_leak_from_evaluation_split_is_found(store_path, panels, by):
     leak, spoilt = LEAKS[by]
-    assert beside(store_path, "leakage", panel=panels[by]).status == "pass"
-    finding = beside(store_path, "leakage", HELD_OUT.format(by, f"({spoilt})"), panel=panels[by])
+    assert finding_on(store_path, "leakage", panel=panels[by]).status == "pass"
+    finding = finding_on(
+        store_path, "leakage", HELD_OUT.format(by, f"({spoilt})"), panel=panels[by]
+    )
     assert finding.status == "fail"
     assert leak in {row["leak"] for row in finding.sample}
 
 
-def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path):
-    one, name = recording_transitions(1), f"{7:016x}"
+def test_copy_of_held_out_step_is_leak(tmp_path):
+    table, name = recording_transitions(1), f"{7:016x}"
     copied = {
-        "recording_id": [name] * len(one),
-        "episode_id": [f"{name}/{index}" for index in one["episode_index"].to_pylist()],
-        "transition_id": (np.int64(7) << 25) + np.arange(len(one)),
-        "ingest_id": ["copy"] * len(one),
+        "recording_id": [name] * len(table),
+        "episode_id": [f"{name}/{index}" for index in table["episode_index"].to_pylist()],
+        "transition_id": (np.int64(7) << 25) + np.arange(len(table)),
+        "ingest_id": ["copy"] * len(table),
     }
-    path = write_store(tmp_path / "store", [one, replaced(one, copied)])
-    # A panel leaves such steps out itself: one of a store without the copy, and one beside it.
+    path = write_store(tmp_path / "store", [table, replaced(table, copied)])
+    # A panel leaves out such copies itself, so it is built from a store without the copy.
     mixture = "[each_condition]\n[evaluation_split]\nby = 'none'"
-    panel = panel_of(write_store(tmp_path / "alone", [one]), mixture, tmp_path / "p")
+    panel = panel_of(write_store(tmp_path / "alone", [table]), mixture, tmp_path / "p")
     spoil = HELD_OUT.format("recording", f"transitions WHERE recording_id = '{name}'")
-    finding = beside(path, "leakage", spoil, panel=panel.path)
+    finding = finding_on(path, "leakage", spoil, panel=panel.path)
     assert {row["leak"] for row in finding.sample} == {"the same step under another id"}
-    assert finding.rows == len(one["episode_id"].unique())
+    assert finding.rows == len(table["episode_id"].unique())
 
 
-def test_strata_of_few_episodes_are_found_in_panels_and_runs(store_path, panels, tmp_path):
+def test_strata_with_few_episodes_are_found(store_path, panels, tmp_path):
     panel = panels["episode"]
-    assert beside(store_path, "few_panel_episodes", panel=panel).status == "pass"
+    assert finding_on(store_path, "few_panel_episodes", panel=panel).status == "pass"
     spoil = "UPDATE panel.strata SET effective_episodes = 2.5 WHERE name = 'wheel_slip'"
-    finding = beside(store_path, "few_panel_episodes", spoil, panel=panel)
+    finding = finding_on(store_path, "few_panel_episodes", spoil, panel=panel)
     assert [row["stratum"] for row in finding.sample] == ["wheel_slip"]
 
-    older = run_with(tmp_path / "run", evaluations=[{"condition": "nominal"}])
-    assert beside(store_path, "few_drawn_episodes", run=older).status == "skipped"
+    older = write_run(tmp_path / "run", evaluations=[{"condition": "nominal"}])
+    assert finding_on(store_path, "few_drawn_episodes", run=older).status == "skipped"
     drawn = [("nominal", index, 10) for index in range(20)]
     drawn += [("wheel_slip", index, count) for index, count in ((0, 500), (1, 3), (2, 3))]
     rows = [
         {"source": "logs", "stratum": stratum, "episode": f"{1:016x}/{index}", "drawn_rows": count}
         for stratum, index, count in drawn
     ]
-    run = run_with(tmp_path / "run", sampled_episodes=rows)
-    (row,) = beside(store_path, "few_drawn_episodes", run=run).sample
+    run = write_run(tmp_path / "run", sampled_episodes=rows)
+    (row,) = finding_on(store_path, "few_drawn_episodes", run=run).sample
     assert (row["stratum"], row["episodes"]) == ("wheel_slip", 3)
     assert row["effective_episodes"] == pytest.approx(1.02, abs=0.01)
 
 
-def test_ones_own_audits_and_thresholds(tmp_path, clean):
+def test_custom_audits_and_thresholds(tmp_path, clean):
     (tmp_path / "slow.sql").write_text(
         "-- severity: error\n-- advice: Drive on.\n-- doc: Slow steps.\n"
         "SELECT transition_id FROM transitions WHERE command_speed_mps < $least LIMIT 3"
@@ -265,7 +267,7 @@ def test_ones_own_audits_and_thresholds(tmp_path, clean):
         None,  # a folder without audits
     ],
 )
-def test_audits_that_cannot_be_loaded_are_refused(tmp_path, text):
+def test_invalid_audit_files_are_refused(tmp_path, text):
     if text is not None:
         (tmp_path / "mine.sql").write_text(text)
     with pytest.raises(ConfigError) as refused:
@@ -283,14 +285,14 @@ def test_audits_that_cannot_be_loaded_are_refused(tmp_path, text):
         (None, "t.toml"),
     ],
 )
-def test_wrong_files_of_thresholds_are_refused(tmp_path, text, place):
+def test_invalid_threshold_files_are_refused(tmp_path, text, place):
     if text is not None:
         (tmp_path / "t.toml").write_text(text)
     with pytest.raises(ConfigError, match=re.escape(place)):
         load_thresholds(tmp_path / "t.toml")
 
 
-def test_thresholds_are_those_the_audits_use():
+def test_shipped_thresholds_match_audit_parameters():
     shipped = load_thresholds()
     assert {name: set(table) for name, table in shipped.items()} == {
         name: audit.parameters for name, audit in AUDITS.items() if audit.parameters
@@ -298,7 +300,7 @@ def test_thresholds_are_those_the_audits_use():
 
 
 @pytest.mark.long
-def test_findings_do_not_depend_on_what_is_held_in_memory(tmp_path, monkeypatch):
+def test_findings_do_not_depend_on_cached_tables(tmp_path, monkeypatch):
     writer = StoreWriter(tmp_path / "store")
     written = [recording_transitions(number) for number in (1, 2, 3)]
     for rows in written:
@@ -306,19 +308,21 @@ def test_findings_do_not_depend_on_what_is_held_in_memory(tmp_path, monkeypatch)
     kept: dict[tuple[int, int], list[str]] = {}
 
     def findings(rows: int, summarised_rows: int) -> list[tuple[str, str, int]]:
-        """With what is held of stores of so many rows at most."""
+        """Return audit, status and row count if tables of at most so many rows are cached."""
         monkeypatch.setattr(definitions, "FEW_ROWS", rows)
         monkeypatch.setattr(definitions, "FEW_SUMMARISED_ROWS", summarised_rows)
         tables: list[str] = []
 
-        def look(_: str) -> None:
+        def note_cached(_: str) -> None:
             held = store.bare.sql("SELECT table_name FROM duckdb_tables()").fetchall()
             tables[:] = {"transitions", "stored_summaries"}.intersection(name for (name,) in held)
 
         with Store(tmp_path / "store") as store:
-            found = run_audits(store.connection, shipped_audits(), load_thresholds(), done=look)
+            found = run_audits(
+                store.connection, shipped_audits(), load_thresholds(), done=note_cached
+            )
             kept[rows, summarised_rows] = sorted(tables)
-            look("")
+            note_cached("")
             assert not tables
             counted = store.sql("SELECT count(reward) FROM transitions").fetchall()
             assert counted == [(sum(map(len, written)),)]  # from the files again
@@ -334,7 +338,7 @@ def test_findings_do_not_depend_on_what_is_held_in_memory(tmp_path, monkeypatch)
     }
 
 
-def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, shell):
+def test_audit_verb_fails_only_on_errors(store_path, tmp_path, shell):
     junit, audit = tmp_path / "audit.xml", ["audit", str(store_path)]
     document = shell.json(*audit, "--junit", junit, code=1)
     assert document["failed"] == 1
@@ -352,7 +356,7 @@ def test_the_verb_fails_on_an_error_and_passes_without(store_path, tmp_path, she
     assert int(ElementTree.fromstring(junit.read_text())[0].get("failures", "")) > 0
 
 
-def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp_path, shell):
+def test_invalid_audit_arguments_exit_2(store_path, panels, tmp_path, shell):
     lost, rows = tmp_path / "lost", recording_transitions(1)
     StoreWriter(lost).write(manifest(rows), rows)
     for file in (lost / "transitions").rglob("*.parquet"):
@@ -361,7 +365,7 @@ def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp
     other = write_store(tmp_path / "other", [recording_transitions(4)])
     drawn = {"source": "logs", "stratum": "a", "episode": f"{1:016x}/0", "drawn_rows": 1}
     rows = [drawn, drawn | {"source": "fresh", "episode": "7"}]
-    run = run_with(tmp_path / "run", sampled_episodes=rows)
+    run = write_run(tmp_path / "run", sampled_episodes=rows)
     (tmp_path / "file").touch()
     for place, words, named in (
         (tmp_path, [], tmp_path),  # no store
@@ -378,24 +382,24 @@ def test_what_the_verb_cannot_audit_exits_2_and_is_named(store_path, panels, tmp
         pass
 
 
-def test_a_panel_of_partly_other_recordings_fails(store_path, panels, tmp_path):
+def test_panel_of_partly_other_store_fails(store_path, panels, tmp_path):
     name, panel = "panel_of_another_store", panels["time"]
-    assert beside(store_path, name, panel=panel).status == "pass"
+    assert finding_on(store_path, name, panel=panel).status == "pass"
     part = write_store(tmp_path / "part", [recording_transitions(1), recording_transitions(4)])
-    finding = beside(part, name, panel=panel)
+    finding = finding_on(part, name, panel=panel)
     assert finding.status == "fail"
     held = Panel.open(panel).meta["recording_id"].to_pylist()
     assert finding.sample == [
         {"recording_id": one, "missing_rows": held.count(one), "panel_recordings": len(set(held))}
         for one in sorted(set(held) - {f"{1:016x}"})
     ]
-    # Rows of the mixture's other stores are not looked for in this one.
+    # Rows from the mixture's other stores are not expected in this one.
     others = "CREATE OR REPLACE TABLE panel.strata AS SELECT * REPLACE ('b' AS source)"
-    assert beside(part, name, f"{others} FROM panel.strata", panel=panel).status == "pass"
+    assert finding_on(part, name, f"{others} FROM panel.strata", panel=panel).status == "pass"
 
 
-def test_junit_is_as_its_readers_expect():
-    """The rules of junit-10.xsd that concern us: names of elements, attributes, and the counts."""
+def test_junit_file_follows_schema():
+    """Check junit-10.xsd's rules on element names, attributes and counts."""
     rows = [{"source_file": "a\x00b\x1b[31m\ud800<&>", "rows": 3}]
     findings = [
         Finding(AUDITS["rare_condition"], "fail", 3, ["rows"], rows, {}),
@@ -404,7 +408,7 @@ def test_junit_is_as_its_readers_expect():
         Finding(AUDITS["leakage"], "skipped", 0, [], [], {}),
     ]
     text = junit_suites({"audit \x07 store": findings}, {"fail"})
-    (root,) = ElementTree.fromstring(text.encode("utf-8"))  # what XML cannot hold is not in it
+    (root,) = ElementTree.fromstring(text.encode("utf-8"))  # fails on characters that XML forbids
     assert root.tag == "testsuite"
     assert root.keys() == ["name", "tests", "failures", "errors", "skipped"]
     assert [root.get(name) for name in ("tests", "failures", "errors", "skipped")] == list("4101")

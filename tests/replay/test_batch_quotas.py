@@ -1,4 +1,4 @@
-"""Quotas of the batch: logged rows as far as they bear it, fresh rows for the rest, or short."""
+"""Batch quotas: logged rows up to their replay limit, fresh rows for the rest, or a shortfall."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def controller(
     known: tuple[bool, ...] = (True, True, True),
     corrected: tuple[bool, ...] = (False, False, False),
 ) -> ShareController:
-    """Return the shares of a run of so many environment steps, of the default schedule."""
+    """Return the share controller of a run of `env_steps` steps with the default schedule."""
     mixture = parse_mixture(text)
     strata = [
         SampledStratum(name, "logs", rule, count, 9, corrected=weighed)
@@ -46,12 +46,12 @@ def controller(
 def drive(
     shares: ShareController, env_steps: int, stock: np.ndarray, batches: int = 400
 ) -> np.ndarray:
-    """Rows fed by stratum and source (3, 2) over a run of which `batches` stand for all."""
+    """Return rows fed by stratum and source (4, 2) over a run; `batches` stand for all of them."""
     fed = np.zeros((4, 2))
     begin = shares.planned.begin_env_steps
     each = shares.planned.online / batches
     for number in range(batches):
-        shares.batches = 0  # each stands for many: shares are always due
+        shares.batches = 0  # each stands for many, so shares are always recomputed
         shares.at(begin + (env_steps - begin) * number / batches, stock)
         logged = shares.shares * shares.logs_share * each
         shares.drawn = shares.drawn + np.round(logged).astype(np.int64)
@@ -61,8 +61,8 @@ def drive(
 
 
 @pytest.mark.parametrize("env_steps", [48_000, 128_000, 200_000, 288_000, 1_800_000])
-def test_a_quota_holds_at_every_budget(env_steps):
-    """It was redistributed to nominal: from 288,000 steps on quotas were natural rates."""
+def test_quotas_hold_at_every_budget(env_steps):
+    """Regression: from 288,000 steps on, quotas were redistributed to nominal."""
     shares = controller(env_steps)
     np.testing.assert_allclose(shares.shares, [0.4, 0.3, 0.3])  # offline, whatever the budget
     fed = drive(shares, env_steps, PLENTY)
@@ -76,14 +76,14 @@ def test_a_quota_holds_at_every_budget(env_steps):
     assert near["logs_share"] + near["fresh_share"] == pytest.approx(0.3)
 
 
-def test_half_of_a_quota_is_logged_where_the_rows_bear_it():
+def test_half_of_quota_is_logged_if_limits_allow():
     shares = controller(20_000)
     shares.at(2_000, PLENTY)
     assert shares.logs_share == pytest.approx(0.5)
     np.testing.assert_allclose(shares.fresh_shares, [0.2, 0.15, 0.15, 0], atol=1e-12)
 
 
-def test_logged_rows_fill_in_while_the_ring_is_empty():
+def test_logged_rows_fill_quotas_while_ring_is_empty():
     shares = controller(20_000)
     shares.at(2_000, np.zeros(3))
     np.testing.assert_allclose(shares.shares * shares.logs_share, [0.4, 0.3, 0.3])
@@ -93,13 +93,13 @@ def test_logged_rows_fill_in_while_the_ring_is_empty():
     np.testing.assert_allclose(shares.shares * shares.logs_share, [0.3, 0.25, 0.3], atol=0.01)
 
 
-def test_what_neither_has_is_short_and_nominal_does_not_take_it():
+def test_shortfall_is_not_given_to_nominal():
     shares = controller(1_800_000, known=(True, True, False))
     fed = drive(shares, 1_800_000, PLENTY)
     nominal, slip, near, anything = fed.sum(axis=1) / fed.sum()
     assert (nominal, slip) == pytest.approx((0.4, 0.3), abs=0.002)
     assert near < 0.005
-    assert anything == pytest.approx(0.3 - near, abs=0.002)  # rows of any kind, and named
+    assert anything == pytest.approx(0.3 - near, abs=0.002)  # rows of any stratum, reported as such
     row = shares.forecast()[2]
     assert row["short_share"] == pytest.approx(0.3 - row["logs_share"])
     assert row["reason"] == (
@@ -110,22 +110,22 @@ def test_what_neither_has_is_short_and_nominal_does_not_take_it():
     controller(1_800_000, text="shortfall = 'refuse'\n" + QUOTAS)  # the ring fills it
 
 
-def test_logged_rows_alone_fill_a_quota_without_fresh_rows():
-    """They gave half of it, and the rest was short, whatever they could bear."""
+def test_logged_rows_fill_quota_without_fresh_rows():
+    """Regression: they gave half of the quota and left the rest short, whatever their limit."""
     for hindered in ({"known": (True, True, False)}, {"corrected": (False, False, True)}):
         shares = controller(10_000, **hindered)
         shares.at(2_000, PLENTY)
         assert (shares.shares * shares.logs_share)[2] == pytest.approx(0.3)
         assert shares.fresh_shares[3] == pytest.approx(0, abs=1e-12)
         assert shares.forecast()[2]["short_share"] == 0
-    # Weights would take away what a boost of fresh rows gives.
+    # Importance weights would undo a boost of fresh rows.
     shares = controller(1_800_000, corrected=(False, False, True))
     shares.at(2_000, PLENTY)
     assert shares.fresh_shares[2] == 0
     assert "importance weights" in str(shares.forecast()[2]["reason"])
 
 
-def test_without_quotas_the_ring_is_drawn_from_as_it_is():
+def test_ring_is_drawn_without_strata_if_no_quotas():
     shares = controller(48_000, text="[each_condition]\nshare = 'natural'\n")
     shares.at(2_000, PLENTY)
     np.testing.assert_array_equal(shares.fresh_shares, [0, 0, 0, 0.5])
@@ -151,7 +151,7 @@ def test_no_stratum_gets_more_than_its_quota(rows, stock, env_steps, known):
     assert (logs * shares.planned.online <= left * 1.0001).all()
 
 
-def test_another_plan_changes_what_logged_rows_give():
+def test_replanning_changes_logged_share():
     shares = controller(288_000)
     shares.at(2_000, PLENTY)
     before = shares.logs_share
@@ -162,7 +162,7 @@ def test_another_plan_changes_what_logged_rows_give():
 
 
 def ring_of(strata: list[int], rows: int = 40) -> FreshRing:
-    """Return a ring in which one ended episode's steps are in these strata, -1: in none."""
+    """Return a ring with one ended episode whose steps are in these strata (-1: in none)."""
     ring = FreshRing(rows, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
     keys = [append(ring, step, ends=step == len(strata) - 1) for step in range(len(strata))]
     ring.set_labels(keys[-1], np.zeros(len(strata), np.int64), np.array(strata))
@@ -177,28 +177,28 @@ def append(ring: FreshRing, step: int, ends: bool = False) -> int:
     return int(ring.append(**values, **ended, env_step=step, gradient_step=0)[0])
 
 
-def test_a_ring_gives_rows_of_a_stratum_and_none_too_often():
+def test_ring_draws_by_stratum_within_limit():
     ring, rng = ring_of([0, 0, 1, -1, 1]), np.random.default_rng(0)
     assert ring.stratum_rows.tolist() == [2, 2]
     drawn = np.concatenate([ring.draw(np.array([1, 0]), rng, limit=3) for _ in range(20)])
     assert set(drawn.tolist()) == {0, 1}
-    assert np.bincount(drawn).max() == 3  # then the stratum gives none
+    assert np.bincount(drawn).max() == 3  # then the stratum is exhausted
     assert ring.by_stratum.counts.tolist() == [0, 2]
-    assert ring.stratum_rows.tolist() == [2, 2]  # they are still there
+    assert ring.stratum_rows.tolist() == [2, 2]  # exhausted rows still count
     assert set(ring.draw(np.array([0, 9]), rng).tolist()) == {2, 4}
     assert set(ring.draw(np.array([0, 9]), rng, since=3).tolist()) == {4}
 
 
-def test_a_row_that_is_overwritten_leaves_its_stratum():
+def test_overwritten_row_leaves_its_stratum():
     ring = ring_of([0, 0, 1, 1], rows=4)
     ring.draw(np.array([5, 5]), np.random.default_rng(0))
     state = ring.state_dict()
-    again = FreshRing(4, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
-    again.load_state_dict(state)
-    np.testing.assert_array_equal(again.draws, ring.draws)
+    restored = FreshRing(4, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
+    restored.load_state_dict(state)
+    np.testing.assert_array_equal(restored.draws, ring.draws)
     for _ in range(2):
         append(ring, 9)
     assert ring.by_stratum.counts.tolist() == [0, 2]
     assert ring.stratum.tolist() == [-1, -1, 1, 1]
     assert ring.draws[:2].tolist() == [0, 0]
-    assert again.by_stratum.counts.tolist() == [2, 2]
+    assert restored.by_stratum.counts.tolist() == [2, 2]

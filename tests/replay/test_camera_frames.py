@@ -1,4 +1,4 @@
-"""Frames of cameras for rows of a store: in SQL, decoded in Python, and as LeRobot's images."""
+"""Camera frames of store rows: in SQL, decoded in Python, and exported as LeRobot images."""
 
 import io
 import json
@@ -36,12 +36,12 @@ def store_path(tmp_path_factory) -> Path:
     return folder / "store"
 
 
-def stored(folder: Path, cameras: dict, text: str = FRONT_ONLY) -> Path:  # type: ignore[type-arg]
+def ingest_cameras(folder: Path, cameras: dict, text: str = FRONT_ONLY) -> Path:  # type: ignore[type-arg]
     ingest(camera_bag(folder / "bag", cameras), profile_with(text), store=StoreWriter(folder / "s"))
     return folder / "s"
 
 
-def test_frames_are_views_of_the_store(store_path):
+def test_frames_are_views_of_store(store_path):
     with Store(store_path) as store:
         rows = store.sql(
             "SELECT camera, count(*), min(age_s), max(age_s) FROM transition_frames"
@@ -57,7 +57,7 @@ def test_frames_are_views_of_the_store(store_path):
         assert documented == [(0,)]
 
 
-def test_frames_of_rows_are_decoded_when_asked(store_path):
+def test_frames_of_rows_are_decoded(store_path):
     with Store(store_path) as store:
         found = list(camera_frames(store, "FROM transitions WHERE step_index < 3", "rear"))
         for step, frame in enumerate(found):
@@ -73,7 +73,7 @@ def test_frames_of_rows_are_decoded_when_asked(store_path):
             list(camera_frames(store, "SELECT 1 AS x"))
 
 
-def test_a_frame_whose_bytes_changed_is_not_shown(store_path):
+def test_frame_with_changed_bytes_is_refused(store_path):
     import dataclasses
 
     with Store(store_path) as store:
@@ -83,7 +83,7 @@ def test_a_frame_whose_bytes_changed_is_not_shown(store_path):
         changed.image()
 
 
-def test_lerobot_has_the_frames_as_they_were_recorded(store_path, tmp_path):
+def test_lerobot_export_keeps_recorded_frames(store_path, tmp_path):
     document = export_dataset(store_path, "lerobot", tmp_path / "a")
     assert (document["transitions"], document["left_out"]) == (29, {})
     info = json.loads((tmp_path / "a/meta/info.json").read_text())
@@ -105,8 +105,8 @@ def test_lerobot_has_the_frames_as_they_were_recorded(store_path, tmp_path):
     ]
 
 
-@pytest.mark.long  # another Python starts
-def test_lerobot_itself_reads_the_images(store_path, tmp_path):
+@pytest.mark.long  # starts another Python
+def test_lerobot_reads_exported_images(store_path, tmp_path):
     export_dataset(store_path, "lerobot", tmp_path / "a")
     images = read_with("lerobot", tmp_path / "a")["images"]
     assert images.keys() == {"observation.images.front", "observation.images.rear"}
@@ -117,10 +117,10 @@ def test_lerobot_itself_reads_the_images(store_path, tmp_path):
     np.testing.assert_allclose(images["observation.images.front"]["corner"], expected, atol=0.05)
 
 
-def test_steps_without_a_frame_are_left_out_and_counted(tmp_path):
+def test_steps_without_frame_are_left_out_and_counted(tmp_path):
     times = 2 + np.arange(40) * 0.1  # the camera is late by two seconds
     files = [file_of(picture(number)) for number in range(40)]
-    store = stored(tmp_path, {FRONT: compressed(files, times)})
+    store = ingest_cameras(tmp_path, {FRONT: compressed(files, times)})
     document = export_dataset(store, "lerobot", tmp_path / "a")
     assert document["left_out"] == {"no frame of camera front": 10}
     assert document["rows"] == document["transitions"] + 10 == 29
@@ -128,10 +128,10 @@ def test_steps_without_a_frame_are_left_out_and_counted(tmp_path):
     assert "images" not in (tmp_path / "b/meta/info.json").read_text()
 
 
-def test_grey_frames_get_three_channels_deep_ones_are_refused(tmp_path):
+def test_grey_frames_are_converted_16_bit_ones_refused(tmp_path):
     grey = [file_of(picture(number, 1)) for number in range(60)]
     depth = [np.full((4, 6), number * 500, np.uint16) for number in range(60)]
-    store = stored(tmp_path, {FRONT: compressed(grey), REAR: raw(depth, "16UC1")}, CAMERAS)
+    store = ingest_cameras(tmp_path, {FRONT: compressed(grey), REAR: raw(depth, "16UC1")}, CAMERAS)
     document = export_dataset(store, "lerobot", tmp_path / "a", cameras=["front"])
     assert document["notes"] == [
         "observation.images.front: 0 pictures as they were recorded; 29 of jpeg, 1 channels as PNG"
@@ -147,12 +147,12 @@ def test_grey_frames_get_three_channels_deep_ones_are_refused(tmp_path):
 
 def test_frames_of_two_sizes_are_refused(tmp_path):
     files = [file_of(picture(number)[: 32 if number < 30 else 16]) for number in range(60)]
-    store = stored(tmp_path, {FRONT: compressed(files)})
+    store = ingest_cameras(tmp_path, {FRONT: compressed(files)})
     with pytest.raises(StoreError, match="48 x 16 and of 48 x 32 pixels"):
         export_dataset(store, "lerobot", tmp_path / "a")
 
 
-def test_the_command_line_names_cameras(store_path, tmp_path, shell):
+def test_export_verb_takes_cameras(store_path, tmp_path, shell):
     export = ["export", str(store_path), "--out", str(tmp_path / "a"), "--to"]
     assert "observation.images.front: 29 pictures as they were recorded" in shell.out(
         *export, "lerobot", "--cameras", "front"
@@ -161,7 +161,7 @@ def test_the_command_line_names_cameras(store_path, tmp_path, shell):
     assert "holds no images" in shell.err(*export, "minari", "--cameras", "front")
 
 
-def test_a_trace_names_the_frames_of_its_row(store_path, shell):
+def test_trace_lists_frames_of_row(store_path, shell):
     with Store(store_path) as store:
         (front, *_) = camera_frames(store, "FROM transitions WHERE step_index = 2", "front")
     argv = ["trace", str(store_path), str(front.transition_id)]

@@ -1,4 +1,4 @@
-"""Capacity by task diversity: against a naive count over the newest rows."""
+"""Recommended capacity by task diversity, compared with a naive count over the newest rows."""
 
 from collections import Counter
 
@@ -22,7 +22,7 @@ def cells(rows: list[dict[str, object]]) -> int:
     return len({(row["condition"], row["zone"], row["action"]) for row in rows})
 
 
-def test_the_recommendation_is_that_of_a_naive_count(store_path, transitions):
+def test_recommendation_matches_naive_count(store_path, transitions):
     rows = newest_first(transitions)
     with Store(store_path) as store:
         found = recommend_capacity(store.connection, 0.9, effective_episodes=0)
@@ -38,27 +38,27 @@ def test_the_recommendation_is_that_of_a_naive_count(store_path, transitions):
     assert cells(rows[: found.recommended - 1]) < 0.9 * found.cells
 
 
-def effective(rows: list[dict[str, object]]) -> float:
+def effective_episodes_of(rows: list[dict[str, object]]) -> float:
     counts = Counter(row["episode_id"] for row in rows)
     return sum(counts.values()) ** 2 / sum(n * n for n in counts.values())
 
 
-def test_the_rows_must_be_worth_so_many_episodes_too(store_path, transitions):
+def test_recommendation_reaches_effective_episodes(store_path, transitions):
     rows = newest_first(transitions)
-    half = effective(rows) / 2
+    half = effective_episodes_of(rows) / 2
     with Store(store_path) as store:
         found = recommend_capacity(store.connection, 0.01, effective_episodes=half)
         too_many = recommend_capacity(store.connection, 0.01, effective_episodes=1e6)
     needed = found.rows_for_episodes
     assert needed is not None
     assert found.recommended == max(needed, found.rows_for_cells)
-    assert effective(rows[:needed]) >= half > effective(rows[: needed - 1])
+    assert effective_episodes_of(rows[:needed]) >= half > effective_episodes_of(rows[: needed - 1])
     assert too_many.rows_for_episodes is None
     assert too_many.recommended == len(rows)
     assert "all of them are worth less than 1e+06" in too_many.reason
 
 
-def test_whether_coverage_is_saturated_is_said(tmp_path, shell):
+def test_saturation_of_coverage_is_reported(tmp_path, shell):
     growing = write_store(tmp_path / "growing", [recording_transitions(1)])
     with Store(growing) as store:
         found = recommend_capacity(store.connection)
@@ -72,7 +72,7 @@ def test_whether_coverage_is_saturated_is_said(tmp_path, shell):
         assert recommend_capacity(store.connection).saturated
 
 
-def test_the_verb_recommends(store_path, shell):
+def test_audit_verb_recommends_capacity(store_path, shell):
     document = shell.json("audit", store_path, "--capacity")["capacity"]
     assert document["curve"][-1]["capacity"] == document["rows"]
     assert document["curve"][-1]["cells_share"] == 1.0
@@ -80,6 +80,6 @@ def test_the_verb_recommends(store_path, shell):
 
 
 @pytest.mark.parametrize(("share", "episodes"), [(2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)])
-def test_wrong_shares_and_numbers_of_episodes_are_refused(store_path, share, episodes):
+def test_invalid_shares_and_episode_counts_are_refused(store_path, share, episodes):
     with Store(store_path) as store, pytest.raises(ConfigError, match=r"cells_share must be in"):
         recommend_capacity(store.connection, share, episodes)

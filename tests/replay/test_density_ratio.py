@@ -1,4 +1,4 @@
-"""The density ratio where it is known: outcomes stay as they are, states stay boosted."""
+"""Density ratio against known values: outcome rates are restored, risky states stay boosted."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ COUNT = 30_000
 
 
 def slippery(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Features (n, 4), the true chance of a slip (n,), and whether it slipped (n,)."""
+    """Return features (n, 4), the true probability of a slip (n,), and whether it slipped (n,)."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(COUNT, 4))
     chance = 1 / (1 + np.exp(-(-3.0 + 1.2 * x[:, 0] - 0.8 * x[:, 1])))
@@ -36,7 +36,7 @@ def strata(correction: str) -> list[ResolvedStratum]:
     ]
 
 
-def test_the_estimate_is_the_true_ratio():
+def test_estimate_matches_true_ratio():
     x, chance, slipped = slippery()
     share = 0.5
     boost = np.array([share / slipped.mean(), (1 - share) / (1 - slipped.mean())])
@@ -52,7 +52,7 @@ def test_the_estimate_is_the_true_ratio():
     np.testing.assert_allclose(clipped, np.minimum(ratio, 2.0))
 
 
-def test_a_fit_on_part_of_the_common_outcome_is_of_all():
+def test_fit_on_weighted_subsample_is_unbiased():
     x, chance, slipped = slippery()
     rng = np.random.default_rng(1)
     kept = slipped | (rng.random(COUNT) < 0.2)
@@ -62,8 +62,8 @@ def test_a_fit_on_part_of_the_common_outcome_is_of_all():
 
 
 @pytest.mark.parametrize("estimate", ["true", "useless"])
-def test_outcomes_stay_as_they_are_however_good_the_fit(estimate):
-    """P(slip | state) after weights is what it was, in every part of the state space."""
+def test_outcome_rates_are_restored_even_by_useless_fit(estimate):
+    """The weighted P(slip | state) equals the logged one in every part of the state space."""
     _, chance, slipped = slippery()
     code = np.where(slipped, 0, 1).astype(np.int16)
     state = np.ones(COUNT, np.int16)
@@ -78,14 +78,14 @@ def test_outcomes_stay_as_they_are_however_good_the_fit(estimate):
     for part in range(5):
         mine = risk == part
         after = (drawn * weight)[mine & slipped].sum() / (drawn * weight)[mine].sum()
-        # Within a part the ratio varies, and with it where in the part the rows lie.
+        # The ratio varies within a part, which shifts the weighted rows inside it.
         assert after == pytest.approx(slipped[mine].mean(), rel=0.12)
     # Uncorrected, slips are far too frequent.
     raw = drawn[(risk == 2) & slipped].sum() / drawn[risk == 2].sum()
     assert raw > 4 * slipped[risk == 2].mean()
 
 
-def test_risky_states_stay_boosted_unlike_with_full_correction():
+def test_density_ratio_keeps_risky_states_boosted():
     _, chance, slipped = slippery()
     code = np.where(slipped, 0, 1).astype(np.int16)
     state, shares = np.ones(COUNT, np.int16), np.array([0.5, 0.5])
@@ -93,17 +93,17 @@ def test_risky_states_stay_boosted_unlike_with_full_correction():
     drawn = (shares / np.bincount(code))[code]
     risky = chance > 0.3
 
-    def of_risky(correction: str, given: NDArray[np.float32] | None = None) -> float:
+    def risky_share(correction: str, given: NDArray[np.float32] | None = None) -> float:
         rule = CorrectionRule(clip=50.0)
         weight = importance_weights(code, state, strata(correction), shares, rule, given)
         return float((drawn * weight)[risky].sum())
 
     natural = risky.mean()
-    assert of_risky("full") == pytest.approx(natural, rel=0.01)
-    assert of_risky("density_ratio", outcome) == pytest.approx(drawn[risky].sum(), rel=0.05)
+    assert risky_share("full") == pytest.approx(natural, rel=0.01)
+    assert risky_share("density_ratio", outcome) == pytest.approx(drawn[risky].sum(), rel=0.05)
     assert drawn[risky].sum() > 2.5 * natural
-    # What that costs: between the natural sample of full correction and the uncorrected one.
-    worth = {
+    # Its effective count is between those of full and of no correction.
+    effective = {
         name: effective_count(
             drawn
             * importance_weights(
@@ -112,20 +112,20 @@ def test_risky_states_stay_boosted_unlike_with_full_correction():
         )
         for name, given in (("none", None), ("density_ratio", outcome), ("full", None))
     }
-    assert worth["full"] == pytest.approx(COUNT, rel=1e-3)
-    assert worth["none"] < worth["density_ratio"] < worth["full"]
+    assert effective["full"] == pytest.approx(COUNT, rel=1e-3)
+    assert effective["none"] < effective["density_ratio"] < effective["full"]
 
 
 TEXT = """
 [correction]
 post = "density_ratio"
-below_natural = "allow"  # labels at random: no state tells of them
+below_natural = "allow"  # labels are random: no state predicts them
 [each_condition]
 share = "equal"
 """
 
 
-def test_a_panel_keeps_the_estimates_that_new_shares_need(transitions, tmp_path):
+def test_panel_keeps_outcome_probabilities(transitions, tmp_path):
     mixture = parse_mixture(TEXT)
     with open_source(transitions, mixture, task=TASK, conditions=CONDITIONS) as source:
         plan = plan_panel(source.connection, mixture, source.conditions)
@@ -141,21 +141,21 @@ def test_a_panel_keeps_the_estimates_that_new_shares_need(transitions, tmp_path)
     for name in fit.strata:
         chance = panel.meta[f"probability_of_{name}"].to_numpy()
         assert ((chance >= 0) & (chance <= 1)).all()
-        # The labels of these rows are drawn by chance: what the features say of them is the mean.
+        # These labels are random, so the features predict only their mean.
         assert chance.mean() == pytest.approx(
             (panel.meta["stratum"].to_pylist()).count(name) / len(panel), abs=0.02
         )
     assert panel.header.ratios == [fit]
 
 
-def test_rows_of_another_task_change_no_estimate(tmp_path):
-    """Their observations are of another size, and may lie in the same batch."""
+def test_rows_of_other_task_do_not_change_estimates(tmp_path):
+    """Their observations have another size and may be in the same batch."""
     other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
     mine = recording_transitions(2)
     alone = write_store(tmp_path / "alone", [mine])
     beside = write_store(tmp_path / "beside", [recording_transitions(1, task=other)], task=other)
     write_store(beside, [mine])
-    split = '[evaluation_split]\nby = "none"'  # which is of all episodes of a store
+    split = '[evaluation_split]\nby = "none"'  # a split would cover all episodes of a store
     mixture = parse_mixture(f"where = \"task_hash = '{TASK.hash}'\"\n{TEXT}\n{split}")
     panels = [
         build_panel(Store(path), mixture, tmp_path / f"of-{path.name}") for path in (alone, beside)

@@ -1,4 +1,4 @@
-"""Drift: the tests hold their level on correlated logs, and a worn wheel is named."""
+"""Drift: the tests keep their significance level on correlated logs and find a worn wheel."""
 
 from importlib.resources import files
 from typing import Any
@@ -23,7 +23,7 @@ def rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, An
     return found
 
 
-def of_samples(signals: pa.Table, conditions: pa.Table | None = None) -> duckdb.DuckDBPyConnection:
+def drift_views(signals: pa.Table, conditions: pa.Table | None = None) -> duckdb.DuckDBPyConnection:
     """Return the views of drift.sql over given samples."""
     connection = duckdb.connect()
     connection.register("episode_signals", signals)
@@ -50,7 +50,7 @@ def samples(
     part: str = "gyro",
     signal: str = "bias",
 ) -> pa.Table:
-    """`episode_signals` of (robot, site, week) -> for each recording the values of its episodes."""
+    """Return `episode_signals`; `values`: (robot, site, week) -> episode values by recording."""
     lines = [
         {
             "robot": robot,
@@ -73,7 +73,7 @@ def samples(
 def correlated(
     rng: np.random.Generator, recordings: int, episodes: int, steps: int = 60
 ) -> list[np.ndarray]:
-    """Means of episodes whose steps wander, in recordings that differ from each other."""
+    """Return episode means of autocorrelated steps, with a random offset per recording."""
     return [
         np.array([wander(rng, steps, 1.0, 0.95).mean() + base for _ in range(episodes)])
         for base in rng.normal(0, 0.3, recordings)
@@ -81,8 +81,8 @@ def correlated(
 
 
 @pytest.mark.parametrize("df", [1, 2, 3, 4, 7, 20, 51, 200])
-def test_students_t_is_scipys(df):
-    connection = of_samples(samples({("a", "x", 0): [np.ones(1)]}))
+def test_student_t_matches_scipy(df):
+    connection = drift_views(samples({("a", "x", 0): [np.ones(1)]}))
     for t in (0.0, 0.4, -2.0, 5.0, 12.0):
         p = connection.sql(f"SELECT student_p({t}::DOUBLE, {df})").fetchall()[0][0]
         assert p == pytest.approx(max(2 * stats.t.sf(abs(t), df), 1e-15), rel=1e-6, abs=1e-14)
@@ -91,11 +91,11 @@ def test_students_t_is_scipys(df):
         assert quantile == pytest.approx(stats.t.ppf(0.975, df), rel=2e-3)
 
 
-def test_the_test_and_its_sizes_are_scipys():
+def test_statistic_and_effect_sizes_match_scipy():
     rng = np.random.default_rng(3)
     early, late = rng.normal(0, 1, 24), rng.normal(0.9, 1, 31)
     table = samples({("a", "x", 0): [early], ("a", "x", 1): [late]})
-    [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
+    [row] = rows(drift_views(table), "FROM drift WHERE against = 'own reference'")
     trimmed = stats.ttest_ind(late, early, trim=0.1)
     low, high = trimmed.confidence_interval()
     assert row["p"] == pytest.approx(trimmed.pvalue, rel=1e-6)
@@ -106,28 +106,28 @@ def test_the_test_and_its_sizes_are_scipys():
     assert (row["n"], row["n_reference"], row["samples"]) == (31, 24, "episodes")
 
 
-def test_p_is_corrected_as_scipy_does():
+def test_p_correction_matches_scipy():
     rng = np.random.default_rng(4)
     values = {
         (f"r{robot}", f"r{robot}", week): [rng.normal(0.2 * robot * (week == 2), 1, 12)]
         for robot in range(12)
         for week in range(3)
     }
-    found = rows(of_samples(samples(values)), "FROM drift WHERE against = 'own reference'")
+    found = rows(drift_views(samples(values)), "FROM drift WHERE against = 'own reference'")
     p = [row["p"] for row in found]
     assert len(p) == 12
     assert [row["q"] for row in found] == pytest.approx(stats.false_discovery_control(p))
 
 
 @pytest.mark.parametrize("seed", one_in(2, [0, 1]))
-def test_false_alarms_of_correlated_steps_keep_their_level(seed):
+def test_false_alarm_rate_with_correlated_steps(seed):
     rng, robots = np.random.default_rng(seed), 300
     values = {
         (f"r{robot}", f"r{robot}", week): correlated(rng, 3, 5)
         for robot in range(robots)
         for week in range(4)
     }
-    connection = of_samples(samples(values))
+    connection = drift_views(samples(values))
     found = rows(connection, "FROM drift WHERE against = 'own reference' AND period = '2026-03-23'")
     assert {row["samples"] for row in found} == {"recordings"}
     alarms = sum(row["p"] < 0.05 for row in found)
@@ -137,12 +137,12 @@ def test_false_alarms_of_correlated_steps_keep_their_level(seed):
     assert corrected[0]["n"] <= 2
 
 
-def test_false_alarms_of_rates_keep_their_level():
+def test_false_alarm_rate_with_overdispersed_events():
     rng = np.random.default_rng(5)
     robot, week, number, episode = (part.ravel() for part in np.indices((300, 4, 3, 5)))
     names = [f"r{one}" for one in robot]
     drives = [f"{name}-{at}-{one}" for name, at, one in zip(names, week, number, strict=True)]
-    # Some drives meet far more of it than others: not Poisson.
+    # Some drives meet far more events than others: overdispersed, not Poisson.
     rate = rng.gamma(2, 1.0, (300, 4, 3, 1)) * np.ones(5)
     conditions = {
         "robot": names,
@@ -157,7 +157,7 @@ def test_false_alarms_of_rates_keep_their_level():
         "events": rng.poisson(rate).ravel(),
     }
     nothing = samples({("none", "none", 0): [np.ones(1)]})
-    connection = of_samples(nothing, pa.table(conditions))
+    connection = drift_views(nothing, pa.table(conditions))
     found = rows(connection, "FROM drift WHERE part = 'conditions' AND period = '2026-03-23'")
     assert len(found) == 300
     alarms = sum(row["p"] < 0.05 for row in found)
@@ -169,7 +169,7 @@ def worn() -> duckdb.DuckDBPyConnection:
     return fleet([SyntheticRobot("a"), WORN, SyntheticRobot("c")], recordings=3)
 
 
-def test_a_worn_wheel_is_named_and_nothing_else(worn):
+def test_worn_wheel_is_only_finding(worn):
     [found] = rows(worn, "FROM drift_findings WHERE part <> 'driving'")
     assert (found["robot"], found["part"], found["signal"]) == ("b", "wheels", "odometry_scale")
     assert (str(found["since"]), found["periods"], found["periods_tested"]) == (WEEKS[2], 2, 2)
@@ -178,7 +178,7 @@ def test_a_worn_wheel_is_named_and_nothing_else(worn):
     assert "0 of 2 other robots at this site changed alike" in found["finding"]
 
 
-def test_it_also_differs_from_the_other_robots(worn):
+def test_worn_wheel_differs_from_other_robots(worn):
     query = (
         "SELECT period::VARCHAR AS period, verdict FROM drift WHERE against = 'other robots'"
         " AND robot = 'b' AND signal = 'odometry_scale' ORDER BY period"
@@ -188,20 +188,20 @@ def test_it_also_differs_from_the_other_robots(worn):
     assert "differs" not in [verdicts[week] for week in WEEKS[:2]]
 
 
-def test_where_all_robots_of_a_site_change_it_is_the_site():
+def test_change_of_all_robots_has_scope_site():
     slippery = {"odometry_scale": 0.92}
     robots = [SyntheticRobot(name, changes=slippery) for name in "abc"]
     found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE signal = 'odometry_scale'")
     assert {(row["robot"], row["scope"]) for row in found} == {(name, "site") for name in "abc"}
 
 
-def test_robots_of_another_site_are_not_compared_with():
+def test_robots_of_other_sites_are_not_compared():
     robots = [WORN, SyntheticRobot("a", site="other")]
     found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE part = 'wheels'")
     assert [(row["robot"], row["scope"]) for row in found] == [("b", "alone")]
 
 
-def test_lidar_and_floor_are_told_apart():
+def test_lidar_and_floor_changes_are_distinguished():
     robots = [
         SyntheticRobot("a", changes={"lidar_noise_m": 3.0}),
         SyntheticRobot("b", changes={"slips_per_step": 8.0}),
@@ -218,7 +218,7 @@ def test_lidar_and_floor_are_told_apart():
     }
 
 
-def test_too_few_episodes_is_a_verdict():
+def test_too_few_episodes_have_own_verdict():
     lone = fleet([SyntheticRobot("a")], recordings=1, episodes=3)
     verdicts = rows(lone, "SELECT DISTINCT verdict, p FROM drift WHERE part = 'wheels'")
     assert verdicts == [{"verdict": "too few", "p": None}]
@@ -227,13 +227,13 @@ def test_too_few_episodes_is_a_verdict():
     assert verdicts == [{"verdict": "too few"}]
 
 
-def test_recordings_without_tags_are_one_robot_that_is_called_so():
+def test_untagged_recordings_count_as_one_robot():
     mute = SyntheticRobot(None, site=None, changes={"odometry_scale": 0.9})
     [found] = rows(fleet([mute], recordings=3), "FROM drift_findings WHERE part = 'wheels'")
     assert (found["robot"], found["site"], found["scope"]) == ("untagged", "untagged", "alone")
 
 
-def test_signals_that_a_robot_lacks_are_not_made_up():
+def test_missing_signals_are_not_reported():
     blind = SyntheticRobot("a", localiser=False, gyro=False)
     found = rows(fleet([blind], recordings=3), "SELECT DISTINCT signal FROM drift")
     signals = {row["signal"] for row in found}
@@ -242,38 +242,38 @@ def test_signals_that_a_robot_lacks_are_not_made_up():
     assert not signals & (lacking | {"localised_speed_mps", "gyro_yaw_rate_radps"})
 
 
-def test_the_signals_of_a_profile_are_compared_too():
+def test_custom_signals_are_compared():
     connection = fleet([SyntheticRobot("a"), SyntheticRobot("b")], recordings=3)
     install_named(connection, "transitions, recordings")
-    # A battery of robot b that is weaker from week three on.
+    # The battery of robot b is weaker from week three on.
     connection.execute(
         "CREATE TABLE volts AS SELECT *, (24 + sin(transition_id) - 2 * (robot = 'b' AND"
         f" logged_time >= '{WEEKS[2]}')::INT)::FLOAT AS battery_v, true AS lit FROM transitions"
     )
     connection.execute(
-        "CREATE TABLE told AS SELECT * REPLACE (list_transform(['battery_v', 'lit'], lambda name:"
+        "CREATE TABLE listed AS SELECT * REPLACE (list_transform(['battery_v', 'lit'], lambda name:"
         " {name: name}) AS signals) FROM recordings"
     )
     connection.execute("CREATE OR REPLACE VIEW transitions AS FROM volts")
-    connection.execute("CREATE OR REPLACE VIEW recordings AS FROM told")
+    connection.execute("CREATE OR REPLACE VIEW recordings AS FROM listed")
     found = rows(connection, "FROM drift_findings WHERE part = 'custom'")
     assert [(row["robot"], row["signal"]) for row in found] == [("b", "battery_v")]
     lit = rows(connection, "SELECT DISTINCT value FROM episode_signals WHERE signal = 'lit'")
     assert lit == [{"value": 1.0}]
 
 
-def test_constant_values_are_believed_to_a_tenth_of_what_matters():
+def test_constant_values_have_minimal_variance():
     table = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.ones(5)]})
-    [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
+    [row] = rows(drift_views(table), "FROM drift WHERE against = 'own reference'")
     t = 1 / np.sqrt(0.01**2 * (1 / 6 + 1 / 5))
     assert row["verdict"] == "changed"
     assert row["p"] == pytest.approx(max(2 * stats.t.sf(t, 9), 1e-15), rel=1e-3)
     same = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.zeros(5)]})
-    [row] = rows(of_samples(same), "FROM drift WHERE against = 'own reference'")
+    [row] = rows(drift_views(same), "FROM drift WHERE against = 'own reference'")
     assert (row["p"], row["verdict"]) == (1, "unchanged")
 
 
-def test_other_periods_than_weeks(worn):
+def test_periods_other_than_weeks(worn):
     monthly = rows(worn, "FROM drift_by('month') WHERE against = 'own reference'")
     assert {row["verdict"] for row in monthly} == {"too few"}  # a month with nothing before it
     first = rows(

@@ -1,4 +1,4 @@
-"""Events: where a condition began and ended, and what came of it, against a plain loop."""
+"""Events (onset, end and outcome of a condition), compared with a plain loop."""
 
 from collections import defaultdict
 from typing import Any
@@ -14,7 +14,7 @@ PERIOD_NS = 200_000_000
 
 
 def events_by_hand(store: Store) -> dict[str, dict[str, Any]]:
-    """Return what the view says, one row after the other."""
+    """Compute the view's rows with a plain loop."""
     ends = dict(store.sql("SELECT recording_id, end_stamp_ns FROM recordings").fetchall())
     rows = store.sql(
         "SELECT * EXCLUDE (observation, next_observation) FROM transitions ORDER BY ALL"
@@ -73,14 +73,14 @@ def events_of(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def compare(store: Store) -> None:
-    by_hand, seen = events_by_hand(store), events_of(store)
-    assert seen.keys() == by_hand.keys()
+    by_hand, observed = events_by_hand(store), events_of(store)
+    assert observed.keys() == by_hand.keys()
     for name, row in by_hand.items():
-        assert {key: seen[name][key] for key in row} == row, name
+        assert {key: observed[name][key] for key in row} == row, name
 
 
-def test_events_of_random_labels_are_those_of_a_plain_loop(tmp_path):
-    """Rows are missing, drivers take turns, and a third of the episodes end in recovery."""
+def test_events_match_plain_loop(tmp_path):
+    """Some rows are missing, drivers alternate, and a third of the episodes end in recovery."""
     tables = []
     for number in range(1, 10):
         table = recording_transitions(number, episodes=7)

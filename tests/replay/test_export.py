@@ -1,8 +1,8 @@
-"""Exports: trajectories put back together, each format read back, by the real library where it is.
+"""Exports: trajectories are reassembled, and each format is read back by its library if installed.
 
 Not every library can live in one environment (d3rlpy pins an old Gymnasium, lerobot a torch with
 CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON names, else with that of
-`.venv-neighbours` where there is one, else with this one.
+`.venv-neighbours` if there is one, else with this one.
 """
 
 import importlib.util
@@ -35,7 +35,7 @@ from restock.replay.panel.panel import Panel
 SLIP = "FROM held_conditions WHERE condition = 'wheel_slip'"
 
 
-def of(path: Path, **arguments: Any) -> tuple[list[Trajectory], Counts]:
+def read_trajectories(path: Path, **arguments: Any) -> tuple[list[Trajectory], Counts]:
     counts = Counts()
     with open_selection(path, **arguments) as selection:
         found = trajectories(
@@ -57,8 +57,8 @@ def n_step_panel(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
     return panel_of(store, f"n_step = {n_step}\n{where}{EVERY}{NO_SPLIT}", out)
 
 
-def test_whose_drive_it_was_goes_along(tmp_path):
-    """Per row and episode where the format has a place for it, all tags in the provenance."""
+def test_tags_are_exported(tmp_path):
+    """Robot and site are columns if the format has them; all tags are in the provenance."""
     tables = [recording_transitions(number, episodes=3) for number in (1, 2)]
     tags = {"robot": "amr-07", "line": "B"}
     store = write_store(tmp_path / "store", tables, tags=[tags, {}])
@@ -75,15 +75,15 @@ def test_whose_drive_it_was_goes_along(tmp_path):
     export_dataset(panel.path, "parquet", tmp_path / "b.parquet")
     robots = pq.read_table(tmp_path / "b.parquet")["robot"].to_pylist()
     assert robots.count("amr-07") == len(tables[0])
-    # A query that gives no such column exports without it.
+    # The export of a query without these columns lacks them.
     plain = "SELECT * EXCLUDE (robot, site, recording_id) FROM transitions"
     out = tmp_path / "c.parquet"
     assert export_dataset(store, "parquet", out, query=plain)["provenance"]["tags"] == {}
     assert "robot" not in pq.read_schema(out).names
 
 
-def test_an_episode_is_cut_where_a_query_leaves_rows_out(store_path, transitions):
-    found, counts = of(store_path, query=SLIP)
+def test_rows_left_out_by_query_cut_episodes(store_path, transitions):
+    found, counts = read_trajectories(store_path, query=SLIP)
     slipping = {
         row["transition_id"]: row
         for row in transitions.to_pylist()
@@ -100,8 +100,8 @@ def test_an_episode_is_cut_where_a_query_leaves_rows_out(store_path, transitions
         assert t.cut == (not last["terminated"] and not last["truncated"])
 
 
-def test_small_batches_give_the_same_trajectories(store_path, monkeypatch):
-    whole, _ = of(store_path)
+def test_small_batches_give_same_trajectories(store_path, monkeypatch):
+    whole, _ = read_trajectories(store_path)
     monkeypatch.setattr("restock.replay.export.selection.BATCH_ROWS", 7)
     with open_selection(store_path) as selection:
         pieces = [
@@ -116,7 +116,7 @@ def test_small_batches_give_the_same_trajectories(store_path, monkeypatch):
         np.testing.assert_array_equal(one.observations, other.observations)
 
 
-def test_a_step_is_an_end_if_the_next_begins_elsewhere():
+def test_discontinuous_observation_cuts_episode():
     rows = recording_transitions(1, episodes=1)
     broken = rows["next_observation"].to_pylist()
     broken[3][0] += 1.0
@@ -129,10 +129,10 @@ def test_a_step_is_an_end_if_the_next_begins_elsewhere():
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_a_panels_rows_are_single_steps_of_its_store(store_path, tmp_path, n_step):
+def test_panel_exports_single_steps_of_store(store_path, tmp_path, n_step):
     panel = n_step_panel(store_path, tmp_path / "panel", n_step, 'where = "step_index % 5 <> 4"\n')
-    found, counts = of(panel.path)
-    whole, _ = of(store_path)
+    found, counts = read_trajectories(panel.path)
+    whole, _ = read_trajectories(store_path)
     by_id = {
         identity: (t, at)
         for t in whole
@@ -147,7 +147,7 @@ def test_a_panels_rows_are_single_steps_of_its_store(store_path, tmp_path, n_ste
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
-def test_every_format_has_a_provenance_and_fails_whole(to, store_path, tmp_path, monkeypatch):
+def test_formats_have_provenance_and_write_all_or_nothing(to, store_path, tmp_path, monkeypatch):
     if FORMATS[to][1]:
         pytest.importorskip(FORMATS[to][1])
     out = tmp_path / f"out{FORMATS[to][2]}"
@@ -173,7 +173,7 @@ def test_every_format_has_a_provenance_and_fails_whole(to, store_path, tmp_path,
 
 
 def provenance_in(to: str, out: Path) -> Any:
-    """Return what the data set itself says."""
+    """Read the provenance from an exported data set."""
     text: Callable[[], Any] = {
         "parquet": lambda: pq.read_metadata(out).metadata[b"restock"],
         "lerobot": lambda: (out / "meta/restock.json").read_text(),
@@ -183,7 +183,7 @@ def provenance_in(to: str, out: Path) -> Any:
     return json.loads(text())
 
 
-def test_parquet_reads_back(store_path, tmp_path, transitions):
+def test_parquet_round_trip(store_path, tmp_path, transitions):
     document = export_dataset(store_path, "parquet", tmp_path / "a.parquet")
     table, rows = pq.read_table(tmp_path / "a.parquet"), ordered(transitions)
     assert (document["rows"], document["transitions"], document["cut"]) == (len(rows), len(rows), 0)
@@ -200,11 +200,11 @@ def test_parquet_reads_back(store_path, tmp_path, transitions):
 
 
 @pytest.mark.parametrize("continuous", [False, True])
-def test_minari_reads_its_data_set(store_path, tmp_path, continuous):
+def test_minari_reads_export(store_path, tmp_path, continuous):
     minari = pytest.importorskip("minari")
     export_dataset(store_path, "minari", tmp_path / "logs", continuous=continuous)
     dataset = minari.MinariDataset(tmp_path / "logs")
-    expected, counts = of(store_path, continuous=continuous)
+    expected, counts = read_trajectories(store_path, continuous=continuous)
     assert dataset.total_steps == counts.transitions
     space = dataset.action_space
     assert isinstance(space, gymnasium.spaces.Box if continuous else gymnasium.spaces.Discrete)
@@ -220,7 +220,7 @@ def test_minari_reads_its_data_set(store_path, tmp_path, continuous):
         assert ids.tolist() == [*t.carried["transition_id"].tolist(), -1]
 
 
-def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path):
+def test_minari_recovers_twin_environment(tmp_path):
     minari = pytest.importorskip("minari")
     from restock.ingest.profile.profile import load_profile
 
@@ -234,14 +234,14 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path):
     assert gymnasium.spec("restock/Warehouse-v0").kwargs == registered
 
 
-@pytest.mark.long  # another Python starts
-def test_d3rlpy_reads_its_data_sets_and_trains_on_them(store_path, tmp_path):
+@pytest.mark.long  # starts another Python
+def test_d3rlpy_reads_exports_and_trains(store_path, tmp_path):
     pytest.importorskip("h5py")
     files = {False: tmp_path / "actions.h5", True: tmp_path / "commands.h5"}
     for continuous, file in files.items():
         export_dataset(store_path, "d3rlpy", file, query=SLIP, continuous=continuous)
     for continuous, found in zip(files, read_with("d3rlpy", *files.values()), strict=True):
-        expected, counts = of(store_path, query=SLIP, continuous=continuous)
+        expected, counts = read_trajectories(store_path, query=SLIP, continuous=continuous)
         assert found["transitions"] == counts.transitions
         assert found["discrete"] != continuous
         for episode, t in zip(found["episodes"], expected, strict=True):
@@ -250,14 +250,16 @@ def test_d3rlpy_reads_its_data_sets_and_trains_on_them(store_path, tmp_path):
             np.testing.assert_allclose(actions, t.actions, rtol=1e-6)
             np.testing.assert_allclose(episode["rewards"], t.rewards, rtol=1e-6)
             np.testing.assert_allclose(episode["first"], t.observations[:-1, 0], rtol=1e-6)
-            steps = slice(1, -1) if t.terminated else slice(1, None)  # there it gives zeros
+            steps = (
+                slice(1, -1) if t.terminated else slice(1, None)
+            )  # d3rlpy gives zeros after the terminal step
             expected_next = t.observations[steps, 0]
             np.testing.assert_allclose(episode["next_first"][: len(expected_next)], expected_next)
             assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]
 
 
-@pytest.mark.long  # another Python starts
-def test_lerobot_reads_its_data_set(store_path, tmp_path, transitions):
+@pytest.mark.long  # starts another Python
+def test_lerobot_reads_export(store_path, tmp_path, transitions):
     export_dataset(store_path, "lerobot", tmp_path / "a")
     found = read_with("lerobot", tmp_path / "a")
     rows = ordered(transitions)
@@ -282,7 +284,7 @@ def test_lerobot_reads_its_data_set(store_path, tmp_path, transitions):
 STATE = "{'x.vel': wheel_speed_mps, 'theta.vel': degrees(wheel_yaw_rate_radps)}"
 
 
-def test_lerobots_state_may_be_chosen_signals(store_path, tmp_path, transitions):
+def test_lerobot_state_from_chosen_signals(store_path, tmp_path, transitions):
     query = f'SELECT *, {STATE} AS "observation.state" FROM transitions'
     document = export_dataset(store_path, "lerobot", tmp_path / "a", query=query, continuous=True)
     info = json.loads((tmp_path / "a/meta/info.json").read_text())
@@ -290,7 +292,7 @@ def test_lerobots_state_may_be_chosen_signals(store_path, tmp_path, transitions)
     assert info["features"]["observation.state"]["shape"] == [2]
     assert "next.observation.state" not in info["features"]
     rows = ordered(transitions)
-    with open_recording(tmp_path / "a") as recording:  # its own data set is a recording, too
+    with open_recording(tmp_path / "a") as recording:  # an export can be read as a recording
         state = recording.read({"/observation.state": ["x_vel", "theta_vel"]})["/observation.state"]
         command = recording.read({"/action": ["command_speed_mps"]})["/action"]
     assert document["transitions"] == len(state) == len(rows)
@@ -302,7 +304,7 @@ def test_lerobots_state_may_be_chosen_signals(store_path, tmp_path, transitions)
     )
 
 
-def test_rows_whose_chosen_state_is_unknown_are_left_out(store_path, tmp_path, transitions):
+def test_rows_with_unknown_state_are_left_out(store_path, tmp_path, transitions):
     speed = "CASE step_index WHEN 3 THEN NULL WHEN 4 THEN 'nan'::FLOAT ELSE wheel_speed_mps END"
     query = f"""SELECT *, {{'v': {speed}}} AS "observation.state" FROM transitions"""
     document = export_dataset(store_path, "lerobot", tmp_path / "a", query=query)
@@ -322,7 +324,7 @@ def test_rows_whose_chosen_state_is_unknown_are_left_out(store_path, tmp_path, t
         ("parquet", STATE, "the format parquet holds the task's observation"),
     ],
 )
-def test_a_state_that_cannot_be_exported(store_path, tmp_path, to, state, words):
+def test_invalid_state_is_refused(store_path, tmp_path, to, state, words):
     query = f'SELECT *, {state} AS "observation.state" FROM transitions'
     out = tmp_path / ("a.parquet" if to == "parquet" else "a")
     with pytest.raises((QueryError, StoreError), match=words):
@@ -330,7 +332,7 @@ def test_a_state_that_cannot_be_exported(store_path, tmp_path, to, state, words)
     assert not out.exists()
 
 
-def test_lerobots_layout_is_complete_without_lerobot(store_path, tmp_path):
+def test_lerobot_layout_is_complete(store_path, tmp_path):
     out = tmp_path / "a"
     document = export_dataset(store_path, "lerobot", out)
     info = json.loads((out / "meta/info.json").read_text())
@@ -351,7 +353,7 @@ def test_lerobots_layout_is_complete_without_lerobot(store_path, tmp_path):
     reward = pq.ParquetDataset(out / "data").read()["next.reward"].to_numpy()
     np.testing.assert_allclose(stats["next.reward"]["mean"], reward.mean(), rtol=1e-5)
     np.testing.assert_allclose(stats["next.reward"]["std"], reward.std(), rtol=1e-5)
-    pytest.importorskip("pandas")  # whose index the tasks are
+    pytest.importorskip("pandas")  # tasks are the index of a data frame
     tasks = pq.read_table(out / "meta/tasks.parquet").to_pandas()
     assert tasks.iloc[0].name.startswith("Drive along")
 
@@ -374,7 +376,7 @@ REFUSED: list[tuple[dict[str, Any], type[Exception], str]] = [
     (without("next_observation", "truncated"), QueryError, "no next_observation, truncated"),
     (without("command_speed_mps") | {"continuous": True}, QueryError, "no command_speed_mps"),
     (replacing("observation", "1.5"), QueryError, "observation"),
-    # Before: a ValueError, an episode end in every row, and an action of 2.
+    # Regressions: a ValueError, an episode end in every row, and an action of 2.
     (replacing("action", "'a'"), QueryError, "action"),
     (replacing("terminated", "'no'"), QueryError, "terminated"),
     (replacing("action", "2.5"), QueryError, "action"),
@@ -394,7 +396,7 @@ REFUSED: list[tuple[dict[str, Any], type[Exception], str]] = [
 
 
 @pytest.mark.parametrize(("given", "error", "named"), REFUSED)
-def test_what_cannot_be_exported_is_refused(given, error, named, store_path, tmp_path):
+def test_invalid_exports_are_refused(given, error, named, store_path, tmp_path):
     given = {"to": "parquet", "out": "a.parquet"} | given
     with pytest.raises(error, match=re.escape(named)):
         export_dataset(store_path, given.pop("to"), tmp_path / given.pop("out"), **given)
@@ -402,9 +404,9 @@ def test_what_cannot_be_exported_is_refused(given, error, named, store_path, tmp
 
 
 @pytest.mark.parametrize("to", ["minari", "d3rlpy"])
-def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
+def test_hdf5_export_stops_before_disk_is_full(to, store_path, tmp_path, monkeypatch):
     pytest.importorskip(FORMATS[to][1])
-    free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
+    free = iter([10**10, 10**10, 2**20])  # less after each episode
     monkeypatch.setattr(
         "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)
     )
@@ -415,7 +417,7 @@ def test_hdf5_ends_before_a_full_disk(to, store_path, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_panel_is_exported_as_by_a_query_beside_it(store_path, tmp_path):
+def test_panel_exports_same_rows_as_query(store_path, tmp_path):
     panel = n_step_panel(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
     alone, beside = tmp_path / "a.parquet", tmp_path / "b.parquet"
     export_dataset(panel.path, "parquet", alone, continuous=True)
@@ -431,7 +433,7 @@ def test_a_panel_is_exported_as_by_a_query_beside_it(store_path, tmp_path):
         export_dataset(panel.path, "parquet", tmp_path / "c.parquet", query=query)
 
 
-def test_the_verb_says_what_it_wrote(store_path, tmp_path, shell):
+def test_export_verb_reports_counts(store_path, tmp_path, shell):
     out = tmp_path / "a.parquet"
     document = shell.json("export", store_path, "--to", "parquet", "--out", out)
     assert document["transitions"] == document["rows"] == pq.read_metadata(out).num_rows
@@ -442,7 +444,7 @@ def test_the_verb_says_what_it_wrote(store_path, tmp_path, shell):
     assert out == ""
 
 
-def test_a_missing_library_is_named_with_its_command(store_path, tmp_path, monkeypatch):
+def test_missing_library_names_install_command(store_path, tmp_path, monkeypatch):
     find = importlib.util.find_spec
 
     def absent(name: str, package: str | None = None) -> Any:

@@ -1,4 +1,4 @@
-"""Strata by the situation instead of its outcome: quotas, and the audit that tells them apart."""
+"""Strata by exposure instead of outcome: quotas, and the audit that tells them apart."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,13 +19,13 @@ from restock.replay.store.store import Store
 
 EPISODES = 60
 GOAL_REWARD = 5.0  # of the task
-# Every third episode met someone; every other of those came too near, and failed.
+# Every third episode is exposed to traffic; every other of these came too near and failed.
 EXPOSED = [number % 3 == 0 for number in range(EPISODES)]
 NEAR = [number % 6 == 0 for number in range(EPISODES)]
 
 
 def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
-    """Return a recording whose episodes are exposed as EXPOSED, `near` where they came too near."""
+    """Return a recording with exposures as in EXPOSED and near collisions as in `near`."""
     rows = recording_transitions(1, episodes=EPISODES, seed=3)
     episode = rows["episode_index"].to_numpy()
     step = rows["step_index"].to_numpy()
@@ -51,7 +51,7 @@ def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
 
 
 def success_in(plan: PanelPlan, stratum: str, rows: pa.Table) -> float:
-    """Of the episodes in a stratum of the panel, those that reached the goal."""
+    """Return the share of a stratum's episodes that reached the goal."""
     (code,) = [place for place, line in enumerate(plan.strata) if line.name == stratum]
     mine = set(plan.rows.filter(pa.array(plan.stratum == code))["episode_id"].to_pylist())
     good = set(rows.filter(rows["terminated"])["episode_id"].to_pylist())
@@ -63,7 +63,7 @@ BY_OUTCOME = NOMINAL + "share = 0.5\n[each_condition]\nunit = 'episode'\nshare =
 BY_EXPOSURE = BY_OUTCOME + "\nkind = 'exposure'"
 
 
-def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
+def test_exposure_stratum_keeps_successes(tmp_path):
     rows = planted(lambda number: NEAR[number])
     store = write_store(tmp_path / "store", [rows])
     outcome, exposure = planned(store, BY_OUTCOME), planned(store, BY_EXPOSURE)
@@ -75,7 +75,7 @@ def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
     assert success_in(outcome, "nominal", rows) == success_in(exposure, "nominal", rows) == 1
 
 
-def test_no_advice_is_to_add_what_is_there(tmp_path):
+def test_remedy_does_not_suggest_existing_key(tmp_path):
     rows = planted(lambda number: NEAR[number])
     store = write_store(tmp_path / "store", [replaced(rows, {"exposures": [[]] * len(rows)})])
     with pytest.raises(MixtureError, match="belong to no stratum") as refused:
@@ -83,8 +83,8 @@ def test_no_advice_is_to_add_what_is_there(tmp_path):
     assert "each_condition" not in str(refused.value)
 
 
-def test_an_exposure_beside_a_condition_goes_by_priority(tmp_path):
-    """Of steps: a condition goes first, as its priority number is lower."""
+def test_rows_go_to_condition_before_exposure(tmp_path):
+    """Among strata of steps a condition comes first, as its priority number is lower."""
     store = write_store(tmp_path / "store", [planted(lambda number: False)])
     text = "[evaluation_split]\nby = 'none'\n[correction]\npost = 'none'\n" + "".join(
         f"[[strata]]\nname = '{name}'\n"
@@ -92,27 +92,27 @@ def test_an_exposure_beside_a_condition_goes_by_priority(tmp_path):
     )
     lines = {line.name: line for line in planned(store, text).strata}
     assert lines["closing_traffic"].timing == "pre"
-    # Six steps of each exposed episode; two of every other of them are the condition's.
+    # Exposed episodes have six exposed steps; in every other one the condition takes two.
     assert lines["near_collision"].rows == 20
     assert lines["closing_traffic"].rows == 6 * 20 - 20
 
 
-def test_a_panel_of_exposures_is_packed_and_knows_its_conditions(tmp_path):
+def test_exposure_panel_lists_its_conditions(tmp_path):
     store = write_store(tmp_path / "store", [planted(lambda number: NEAR[number])])
     with Store(store) as opened:
         panel = build_panel(opened, parse_mixture(BY_EXPOSURE), tmp_path / "panel")
     assert {"closing_traffic", "nominal"} <= {line.name for line in panel.header.strata}
-    assert panel.header.conditions == [  # of which each row has one: exposures are none
+    assert panel.header.conditions == [  # each row has one of these; exposures are not conditions
         *("recovery", "near_collision", "wheel_slip", "blocked_aisle", "nominal")
     ]
 
 
-def test_a_table_in_memory_names_its_exposures(tmp_path):
+def test_table_in_memory_has_exposure_strata(tmp_path):
     panel = build_panel(planted(lambda number: False), parse_mixture(BY_EXPOSURE), tmp_path / "p")
     assert "closing_traffic" in {line.name for line in panel.header.strata}
 
 
-def test_a_store_without_exposures_has_none_to_ask_for(tmp_path):
+def test_store_without_exposures_is_refused(tmp_path):
     store = write_store(tmp_path / "store", [planted(lambda number: False)])
     with Store(store) as opened, pytest.raises(ConfigError, match="the store has none") as caught:
         plan_panel(opened.connection, parse_mixture(BY_EXPOSURE), CONDITIONS)
@@ -127,7 +127,7 @@ def audited(store: Path) -> tuple[str, list[dict[str, object]]]:
     return finding.status, finding.sample
 
 
-def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, shell):
+def test_audit_finds_condition_chosen_on_outcome(tmp_path, shell):
     store = write_store(tmp_path / "store", [planted(lambda number: NEAR[number])])
     status, sample = audited(store)
     assert status == "warn"
@@ -154,6 +154,6 @@ def test_the_audit_names_a_condition_chosen_on_its_outcome(tmp_path, shell):
         (lambda number: NEAR[number], EXPOSED),  # the condition is the situation
     ],
 )
-def test_the_audit_passes_conditions_that_choose_no_failures(tmp_path, failed, near):
+def test_audit_passes_conditions_without_outcome_bias(tmp_path, failed, near):
     store = write_store(tmp_path / "store", [planted(failed, near)])
     assert audited(store) == ("pass", [])

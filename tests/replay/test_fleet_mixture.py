@@ -21,12 +21,12 @@ TAGS = [{"robot": robot, "site": site} for robot, site in zip("abacd", "ooool", 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory) -> Path:
-    """Five recordings of four robots, of which one drives at another site."""
+    """Return a store of five recordings of four robots, one of them at another site."""
     tables = [recording_transitions(number) for number in range(1, 6)]
     return write_store(tmp_path_factory.mktemp("fleet") / "store", tables, tags=TAGS)
 
 
-def found(panel: Panel, query: str) -> list[tuple[object, ...]]:
+def query_panel(panel: Panel, query: str) -> list[tuple[object, ...]]:
     with open_place(panel.path) as connection:
         return connection.sql(query).fetchall()
 
@@ -48,7 +48,7 @@ def test_whole_robots_and_sites_are_held_out(fleet, by):
     assert len(held_by_seed) > 1
 
 
-def test_a_robot_can_be_held_out_by_its_name(fleet):
+def test_robots_are_held_out_by_name(fleet):
     text = "[evaluation_split]\nby = 'robot'\nrobots = ['c', 'd']\nshare = 0\n" + EVERY
     with Store(fleet) as store:
         plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
@@ -61,7 +61,7 @@ def test_a_robot_can_be_held_out_by_its_name(fleet):
     ("robots", "message"),
     [("['c', 'amr-99']", "admits no rows of amr-99"), ("['a','b','c','d']", "every")],
 )
-def test_robots_that_cannot_be_held_out_are_refused(fleet, robots, message):
+def test_invalid_held_out_robots_are_refused(fleet, robots, message):
     text = f"[evaluation_split]\nby = 'robot'\nrobots = {robots}\n" + EVERY
     with Store(fleet) as store, pytest.raises(MixtureError, match=message) as caught:
         plan_panel(store.connection, parse_mixture(text), store.conditions())
@@ -70,7 +70,7 @@ def test_robots_that_cannot_be_held_out_are_refused(fleet, robots, message):
         parse_mixture(text.replace("'robot'", "'site'"))
 
 
-def test_a_panel_with_rows_of_a_held_out_robot_fails(fleet, tmp_path):
+def test_rows_of_held_out_robot_are_leak(fleet, tmp_path):
     text = "[evaluation_split]\nby = 'robot'\n" + EVERY
     panel = panel_of(fleet, text, tmp_path / "panel")
     chosen = [audit for audit in shipped_audits() if audit.name == "leakage"]
@@ -86,32 +86,32 @@ def test_a_panel_with_rows_of_a_held_out_robot_fails(fleet, tmp_path):
 
 
 @pytest.mark.parametrize("by", ["episode", "recording", "time", "within_episode"])
-def test_only_episodes_that_the_mixture_admits_are_held_out(fleet, by):
-    # The latest recording is of another robot: all that is held out was of it.
+def test_only_admitted_episodes_are_held_out(fleet, by):
+    # Regression: all held-out rows were of the latest recording, which is another robot's.
     text = f"where = \"robot = 'a'\"\n[evaluation_split]\nby = '{by}'\n" + EVERY
     with Store(fleet) as store:
         plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
     robots = np.array(plan.rows["robot"].to_pylist())
     assert set(robots[plan.evaluation_split]) == set(robots[plan.panel_rows]) == {"a"}
-    if by != "recording":  # one of two is half
+    if by != "recording":  # one of two recordings is half
         assert plan.evaluation_split.sum() == pytest.approx(0.1 * (robots == "a").sum(), rel=0.5)
 
 
-def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(tmp_path):
+def test_split_by_robot_needs_known_robots(tmp_path):
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     store = write_store(tmp_path / "store", tables, tags=[{}, {"robot": "a"}, {"robot": "b"}])
     text = "[evaluation_split]\nby = 'robot'\n" + EVERY
-    says = f"{len(tables[0]):,} rows of 1 recording have no robot: they could belong to one that"
-    with pytest.raises(MixtureError, match=says) as refused:
+    message = f"{len(tables[0]):,} rows of 1 recording have no robot: they could belong to one that"
+    with pytest.raises(MixtureError, match=message) as refused:
         panel_of(store, text, tmp_path / "panel")
     assert 'where = "robot IS NOT NULL"' in str(refused.value.remedy)
     panel = panel_of(store, 'where = "robot IS NOT NULL"\n' + text, tmp_path / "panel")
-    assert {name for (name,) in found(panel, "SELECT robot FROM rows")} < {"a", "b"}
-    with pytest.raises(MixtureError, match="have no robot"):  # a table that no store's view shows
+    assert {name for (name,) in query_panel(panel, "SELECT robot FROM rows")} < {"a", "b"}
+    with pytest.raises(MixtureError, match="have no robot"):  # a table without a store
         planned(tables[0], text)
 
 
-def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path):
+def test_oversized_evaluation_split_warns(tmp_path):
     two = pa.concat_tables([recording_transitions(1), recording_transitions(2)])
     text = EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.1"
     plan = planned(two, text)
@@ -123,9 +123,9 @@ def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path):
     assert not planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4").warnings
 
 
-def test_stores_of_two_fleets_are_one_fleet_in_a_mixture(fleet, tmp_path):
+def test_mixture_combines_fleets_of_two_stores(fleet, tmp_path):
     other = write_store(tmp_path / "other", [recording_transitions(9)], tags=[{"robot": "z"}])
     text = f"[sources]\nlogs = 0.5\n[[sources.stores]]\nname = 'z'\npath = '{other}'\nshare = 0.3\n"
     panel = panel_of(fleet, text + NO_SPLIT + EVERY, tmp_path / "panel")
-    robots = {name for (name,) in found(panel, "SELECT DISTINCT robot FROM rows")}
+    robots = {name for (name,) in query_panel(panel, "SELECT DISTINCT robot FROM rows")}
     assert robots == {"a", "b", "c", "d", "z"}

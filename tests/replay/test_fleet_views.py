@@ -1,4 +1,4 @@
-"""A fleet's weeks and robots: counts that add up, and cells that were never seen."""
+"""Coverage of a fleet by week and robot: counts add up, and cells never seen are listed."""
 
 from typing import Any
 
@@ -25,21 +25,21 @@ def fleet(tmp_path_factory) -> Store:
     return Store(write_store(path, tables, tags=TAGS))
 
 
-def requested(store: Store, query: str) -> list[dict[str, Any]]:
+def rows_of(store: Store, query: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = store.sql(query).to_arrow_table().to_pylist()
     return rows
 
 
-def test_every_condition_stands_in_every_week_that_a_robot_drove(fleet):
-    rows = requested(fleet, "FROM coverage_by_week")
-    conditions = {row["condition"] for row in requested(fleet, "FROM conditions")}
+def test_driven_weeks_list_every_condition(fleet):
+    rows = rows_of(fleet, "FROM coverage_by_week")
+    conditions = {row["condition"] for row in rows_of(fleet, "FROM conditions")}
     cells = {(row["robot"], str(row["week"]), row["condition"]) for row in rows}
     driven = {("a", "2023-11-13"), ("a", "2023-12-04"), ("b", "2023-11-13"), (None, "2023-11-20")}
     assert cells == {(*one, condition) for one in driven for condition in conditions}
     assert len(rows) == len(cells)
 
 
-def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
+def test_weekly_counts_match_rows_and_events(fleet):
     week = "CAST(date_trunc('week', {}) AS DATE) AS week"
     rows = fleet.sql(
         f"SELECT robot, {week.format('logged_time')}, condition, count(*),"
@@ -50,30 +50,30 @@ def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
         f"SELECT robot, {week.format('logged_onset_time')}, condition, count(*),"
         " count(*) FILTER (NOT recovered) FROM events GROUP BY ALL"
     ).fetchall()
-    seen = {row[:3]: row[3:] for row in rows}
-    happened = {row[:3]: row[3:] for row in events}
-    for row in requested(fleet, "FROM coverage_by_week"):
+    counted = {row[:3]: row[3:] for row in rows}
+    event_counts = {row[:3]: row[3:] for row in events}
+    for row in rows_of(fleet, "FROM coverage_by_week"):
         cell = row["robot"], row["week"], row["condition"]
-        driven = sum(once for other, (_, _, once) in seen.items() if other[:2] == cell[:2])
-        count, episodes, once = seen.get(cell, (0, 0, 0))
-        began, not_recovered = happened.get(cell, (0, 0))
+        driven = sum(primary for other, (_, _, primary) in counted.items() if other[:2] == cell[:2])
+        count, episodes, primary = counted.get(cell, (0, 0, 0))
+        began, not_recovered = event_counts.get(cell, (0, 0))
         hours = driven * 0.2 / 3600
-        wanted = {
+        expected = {
             "rows_held": count,
             "held_share": count / driven,
             "episodes_held": episodes,
-            "primary_rows": once,
-            "primary_share": once / driven,
+            "primary_rows": primary,
+            "primary_share": primary / driven,
             "hours": hours,
             "events": began,
             "not_recovered": not_recovered,
             "events_per_hour": began / hours,
         }
-        assert {name: row[name] for name in wanted} == pytest.approx(wanted)
-    assert sum(count for count, _ in happened.values()) > 50
+        assert {name: row[name] for name in expected} == pytest.approx(expected)
+    assert sum(count for count, _ in event_counts.values()) > 50
 
 
-def test_weeks_add_up_to_robots(fleet):
+def test_weeks_add_up_to_robot_totals(fleet):
     weeks = (
         "sum(rows_held), sum(episodes_held), sum(primary_rows), sum(goal_episodes), sum(successes),"
         " sum(events), sum(hours)"
@@ -92,16 +92,16 @@ def test_weeks_add_up_to_robots(fleet):
         assert robot[-1] == total[-1]
     assert {robot: weeks for robot, *_, weeks, _ in robots} == {"a": 2, "b": 1, None: 1}
     totals = "SELECT sum(primary_share) AS share, any_value(hours) AS hours FROM coverage_by_robot"
-    shares = requested(fleet, f"{totals} GROUP BY robot")
+    shares = rows_of(fleet, f"{totals} GROUP BY robot")
     assert [row["share"] for row in shares] == pytest.approx([1.0, 1.0, 1.0])
     assert sum(row["hours"] for row in shares) == pytest.approx(
-        requested(fleet, "SELECT count(*) * 0.2 / 3600 AS hours FROM transitions")[0]["hours"]
+        rows_of(fleet, "SELECT count(*) * 0.2 / 3600 AS hours FROM transitions")[0]["hours"]
     )
 
 
-def test_successes_are_of_episodes_with_the_condition(fleet):
-    for row in requested(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
-        (found,) = requested(
+def test_successes_count_episodes_with_condition(fleet):
+    for row in rows_of(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
+        (found,) = rows_of(
             fleet,
             "SELECT count(*) AS episodes, count(*) FILTER (success) AS successes FROM episodes"
             " SEMI JOIN (FROM held_conditions WHERE robot = 'a'"

@@ -1,4 +1,4 @@
-"""`restock coverage gaps`: what is missing, what fills it, and how sure that is."""
+"""`restock coverage gaps`: missing rows, the missions that fill them, and confidence."""
 
 import re
 from pathlib import Path
@@ -25,7 +25,7 @@ KINDS = ("nominal", "wheel_slip", "blocked_aisle")
 
 
 def simulated(rows: pa.Table) -> pa.Table:
-    """Return the rows with their labels for the truth."""
+    """Return the rows with their labels as true conditions."""
     return replaced(rows, {"true_condition": rows["condition"].to_pylist()})
 
 
@@ -51,7 +51,7 @@ share = "natural"
 """
 
 
-def test_a_stratum_lacks_what_its_share_would_draw_too_often(store):
+def test_stratum_lacks_rows_for_its_share(store):
     with Store(store) as opened:
         yields, gaps = find_gaps(opened, parse_mixture(ASKING), name="mine", kinds=KINDS)
         slips = opened.sql(
@@ -59,7 +59,7 @@ def test_a_stratum_lacks_what_its_share_would_draw_too_often(store):
         )
         there = slips.fetchall()[0][0]
     (gap,) = gaps
-    # Half of each batch is logs': .4 of 100 x 10 x .5 draws, at most two of a row.
+    # Half of each batch is logged: 0.4 of 1000 x 0.5 draws, at most two per row.
     assert (gap.cell, gap.needed, gap.there) == ({"stratum": "wheel_slip"}, 100, there)
     assert gap.found.sum() == there
     assert set(gap.thinnest) <= {"aisle_1", "aisle_2", "cross"}
@@ -71,10 +71,10 @@ def test_a_stratum_lacks_what_its_share_would_draw_too_often(store):
     assert filled.forecast is not None
     assert filled.forecast.quantile(0.025) <= order.amount <= filled.forecast.quantile(0.975)
     assert filled.closes_with is not None
-    assert 0.7 < filled.closes_with < 0.9  # what was asked for, .8
+    assert 0.7 < filled.closes_with < 0.9  # 0.8 was requested
 
 
-def test_audits_and_cells_ask_too(store):
+def test_audits_and_cells_report_gaps(store):
     mixture = parse_mixture(ASKING.replace("1000", "10"))
     limits = {
         "rare_condition": {"min_rows": 60, "min_episodes": 5},
@@ -110,14 +110,14 @@ def test_audits_and_cells_ask_too(store):
         ({"thresholds": {"rare_condition": {"min_rows": "x"}}}, "rare_condition.min_rows"),
     ],
 )
-def test_unknown_names_are_refused_with_what_is_near(given, near, store):
-    own = {"my_own_audit": {"least": 3.0}}  # of the same file as for `restock audit --audits`
+def test_unknown_names_suggest_nearest(given, near, store):
+    own = {"my_own_audit": {"least": 3.0}}  # `restock audit --audits` reads the same file
     given["thresholds"] = own | given.get("thresholds", {})
     with Store(store) as opened, pytest.raises(ConfigError, match=near):
         find_gaps(opened, parse_mixture(ASKING), name="mine", **given)
 
 
-def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path):
+def test_condition_that_is_never_primary(tmp_path):
     rows = recording_transitions(0)
     rarer = {"wheel_slip": "blocked_aisle"}
     named = [rarer.get(name, name) for name in rows["condition"].to_pylist()]
@@ -132,7 +132,7 @@ def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path):
     assert by == {"mixture mine"}  # its stratum is empty
 
 
-def test_a_gap_names_its_action(tmp_path, shell):
+def test_gap_names_its_action(tmp_path, shell):
     rows = recording_transitions(1)
     turned = [
         "wheel_slip" in held and action == 3
@@ -151,7 +151,7 @@ def test_a_gap_names_its_action(tmp_path, shell):
     assert not re.search(r"action \d", page)
 
 
-def test_hours_of_logging_where_no_recording_knew_the_truth(tmp_path):
+def test_gaps_without_true_conditions_are_in_hours(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
     with Store(path) as opened:
         yields, gaps = find_gaps(opened, parse_mixture(ASKING), name="mine", kinds=KINDS)
@@ -177,7 +177,7 @@ EQUAL = "[each_condition]\nshare = 'equal'\n"
         "each_condition = { unit = 'episode', share = 'equal' }\n",
     ],
 )
-def test_mix_and_gaps_say_the_same_rows(text, tmp_path, shell):
+def test_mix_and_gaps_report_same_rows(text, tmp_path, shell):
     store = str(write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2, 3)]))
     (tmp_path / "mine.toml").write_text(f"max_replays_per_row = 40\nshortfall = 'shrink'\n{text}")
     chosen = (store, "--mixture", str(tmp_path / "mine.toml"))
@@ -194,8 +194,8 @@ def test_mix_and_gaps_say_the_same_rows(text, tmp_path, shell):
         assert gap["rate_low"] <= gap["missing"] / gap["amount"] <= gap["rate_high"]
 
 
-def test_the_plan_is_the_least_that_fills_every_gap():
-    """One kind fills both gaps a little, one kind each fills them well."""
+def test_plan_is_smallest_that_fills_every_gap():
+    """One kind of mission fills both gaps slowly, two kinds fill one gap each quickly."""
     kinds = ["a"] * 30 + ["b"] * 30 + ["both"] * 30
     yields = Yields([str(i) for i in range(90)], np.ones(90) / 60, kinds, True, pa.table({}))
     found = {
@@ -208,7 +208,7 @@ def test_the_plan_is_the_least_that_fills_every_gap():
     listed = shopping_list(yields, gaps)
     assert [order.supply.kind for order in listed.orders] == ["both"]
     assert 20 <= listed.total <= 24  # 120 / 6, and a little for chance
-    # With nothing but the single kinds it is the sum of both.
+    # Without the shared kind, both single kinds are ordered.
     alone = [kind for kind in kinds if kind != "both"]
     apart = Yields([str(i) for i in range(60)], np.ones(60) / 60, alone, True, pa.table({}))
     gaps = [Gap("test", {"stratum": n}, "rows", 120, 0, found[n][:60]) for n in ("a", "b")]
@@ -217,8 +217,8 @@ def test_the_plan_is_the_least_that_fills_every_gap():
 
 
 @pytest.mark.parametrize("share", [0.2, 0.8])
-def test_a_forecast_holds_as_often_as_it_says(share):
-    """Over fleets drawn from one truth: the missions that were enough, against their quantile."""
+def test_forecast_quantiles_are_calibrated(share):
+    """Compare the missions needed with the forecast's quantile, over simulated fleets."""
     rng, held = np.random.default_rng(3), 0
     for _ in range(120):
 
@@ -238,7 +238,7 @@ def test_a_forecast_holds_as_often_as_it_says(share):
     st.integers(1, 5_000),
     st.integers(0, 2**32 - 1),
 )
-def test_more_is_needed_for_more(found, missing, seed):
+def test_forecast_grows_with_missing_rows(found, missing, seed):
     yields = np.array(found, float)
 
     def needed(amount: float) -> float:
@@ -249,12 +249,12 @@ def test_more_is_needed_for_more(found, missing, seed):
     assert needed(missing) <= needed(100 * missing)
 
 
-def test_a_rare_find_leaves_much_open_and_silence_a_bound():
+def test_forecast_of_rare_and_of_unseen_conditions():
     rng = np.random.default_rng(0)
     once = forecast(np.array([3.0] + [0.0] * 49), np.ones(50), 30, rng=rng)
     assert once.quantile(0.975) / once.quantile(0.5) > 3
     assert not forecast(np.zeros(50), np.ones(50), 30, rng=rng).known
-    # (1 - rate)^without = .05 gives the highest rate that is likely: .632 after 3 without.
+    # (1 - rate)^n = 0.05 gives the highest likely rate: 0.632 after n = 3 missions without.
     assert missions_to_see_one(3) == 3  # 1 - .368^3 = .95
     assert missions_to_see_one(100) == 100
     assert missions_to_see_one(1) == 1
@@ -263,7 +263,7 @@ def test_a_rare_find_leaves_much_open_and_silence_a_bound():
     assert probability_to_close([(np.zeros(50), 30)], 30, rng=rng) == 0
 
 
-def test_the_list_is_a_file_that_reads_back(store, tmp_path, shell):
+def test_missions_file_round_trip(store, tmp_path, shell):
     (tmp_path / "mine.toml").write_text(ASKING)
     args = ["coverage", "gaps", store, "--mixture", tmp_path / "mine.toml"]
     out = tmp_path / "next.toml"
@@ -280,7 +280,7 @@ def test_the_list_is_a_file_that_reads_back(store, tmp_path, shell):
     assert not (tmp_path / "none.toml").exists()
 
 
-def test_a_missions_file_says_what_is_wrong_with_it(tmp_path):
+def test_invalid_missions_files_are_refused(tmp_path):
     whole = MissionsFile(missions=(MissionOrder(kind="wheel_slip", missions=3, zone='"x"'),))
     (tmp_path / "good.toml").write_text(as_toml(whole))
     assert read_missions(tmp_path / "good.toml") == whole
@@ -298,7 +298,7 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path):
             read_missions(tmp_path / "bad.toml")
 
 
-def test_gaps_are_a_table_of_sql(store, tmp_path):
+def test_gaps_can_be_queried_in_sql(store, tmp_path):
     (tmp_path / "mine.toml").write_text(ASKING)
     with Store(store) as opened:
         add_computed_tables(opened)

@@ -1,4 +1,4 @@
-"""`max_age_days` of a mixture counts to when the panel is mixed, not to the newest row."""
+"""`max_age_days` of a mixture is relative to the time of mixing, not to the newest row."""
 
 import time
 
@@ -18,7 +18,7 @@ def clock(monkeypatch) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: NOW_NS)
 
 
-def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path):
+def test_age_is_relative_to_time_of_mixing(tmp_path):
     rows = recording_transitions(0)
     with pytest.raises(MixtureError, match=r"older than max_age_days = 30: .* 26\d\.\d days old"):
         panel_of(rows, "max_age_days = 30\n" + NO_SPLIT + EVERY, tmp_path / "a")
@@ -29,10 +29,12 @@ def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path):
     oldest = panel_of(rows, "max_age_days = 1e300\n" + NO_SPLIT + EVERY, tmp_path / "d")
     assert len(oldest) == len(rows)
     without = panel_of(rows, NO_SPLIT + EVERY, tmp_path / "c")
-    assert without.header.as_of_ns is None  # a panel that counts no ages depends on no clock
+    assert (
+        without.header.as_of_ns is None
+    )  # without an age limit a panel does not depend on the clock
 
 
-def test_a_panel_is_mixed_again_at_the_moment_that_it_keeps(tmp_path, monkeypatch):
+def test_panel_is_reproduced_with_its_as_of_time(tmp_path, monkeypatch):
     text = NO_SPLIT + EVERY
     first = panel_of(recording_transitions(0), "max_age_days = 264\n" + text, tmp_path / "a")
     assert 0 < len(first) < len(recording_transitions(0))

@@ -1,4 +1,4 @@
-"""The messages that a trace names at a tick are those that ingest made the row of."""
+"""The messages that a trace lists at a tick are those from which ingest made the row."""
 
 import re
 from pathlib import Path
@@ -27,7 +27,7 @@ from restock.replay.trace.origin import MessageAtTick, messages_at_tick
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
 ROWS = 6  # each reads the recording again
-# The wheel's joint says more often than the command what time it is, and after the last of them.
+# The joint states are more frequent than the commands and continue after the last one.
 SIGNALS = """
 [signals.left_wheel_radps]
 topic = "/joint_states"
@@ -73,14 +73,14 @@ PROFILES = {
 
 
 @pytest.mark.parametrize("name", one_in(3, PROFILES))
-def test_a_row_was_made_of_the_messages_at_its_tick(name, tmp_path):
+def test_row_matches_messages_at_its_tick(name, tmp_path):
     check(SAMPLE, PROFILES[name], tmp_path)
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize("steps", ["command", "rate"])
 @pytest.mark.parametrize("from_frames", [False, True])
-def test_a_turtlebots_row_was_made_of_the_messages_at_its_tick(steps, from_frames, tmp_path):
+def test_turtlebot_row_matches_messages_at_its_tick(steps, from_frames, tmp_path):
     with open_recording(TURTLEBOT) as recording:
         text = propose_profile(recording, "turtlebot").toml
     text = re.sub('steps = "[a-z]+"', f'steps = "{steps}"', text)
@@ -93,7 +93,7 @@ def test_a_turtlebots_row_was_made_of_the_messages_at_its_tick(steps, from_frame
 
 
 class Battery(Drive):
-    """A drive with a topic that comes with less delay than all others, and goes on after them."""
+    """A drive with a topic that has less delay than all others and continues after them."""
 
     def topics(self) -> dict[str, TopicColumns]:
         at = columns(np.arange(0.0, self.duration_s + 1.0, 0.1), {})
@@ -104,8 +104,8 @@ class Battery(Drive):
 
 
 @pytest.mark.parametrize("rate", [False, True])
-def test_topics_of_custom_signals_are_aligned_as_in_ingest(rate, tmp_path):
-    """By them commands, which have no stamp, lie 1.5 ms later, and a fixed rate ticks on."""
+def test_custom_signal_topics_are_aligned_as_in_ingest(rate, tmp_path):
+    """They move commands, which have no stamp, by 1.5 ms and extend the ticks of a fixed rate."""
     signal = '[signals.volts]\ntopic = "/battery"\ntype = "sensor_msgs/msg/BatteryState"\n'
     text = TEXT + signal + 'path = "voltage"\nunit = "V"\n'
     profile = parse_profile(text.replace(*RATE) if rate else text, where="p")
@@ -113,7 +113,7 @@ def test_topics_of_custom_signals_are_aligned_as_in_ingest(rate, tmp_path):
 
 
 def check(recording: Path, profile: Profile, folder: Path) -> None:
-    """Rows of a recording against the messages at their ticks, value by value."""
+    """Compare rows of a recording with the messages at their ticks."""
     outcome = ingest(recording, profile, store=StoreWriter(folder / "store"))
     rows = StoreWriter(folder / "store").rows(
         outcome.manifest["recording_id"], outcome.manifest["ingest_id"]
@@ -152,9 +152,11 @@ def check_row(profile: Profile, row: dict[str, Any], messages: list[MessageAtTic
         assert value("pose", "y_m") == pytest.approx(row["pose_y_m"])
         assert named["pose"].stamp_ns == row["pose_stamp_ns"]
     else:
-        way = {m.fields["child"]: m for m in messages if m.input == "pose"}
-        assert pose_of(profile, way) == pytest.approx([row["pose_x_m"], row["pose_y_m"]], abs=1e-5)
-        moving = [m.stamp_ns for m in way.values() if m.max_age_s is not None]
+        transforms = {m.fields["child"]: m for m in messages if m.input == "pose"}
+        assert pose_of(profile, transforms) == pytest.approx(
+            [row["pose_x_m"], row["pose_y_m"]], abs=1e-5
+        )
+        moving = [m.stamp_ns for m in transforms.values() if m.max_age_s is not None]
         assert max(moving) == row["pose_stamp_ns"]
     for name, signal in profile.signals.items():
         message = named.get(f"signals.{name}")
@@ -167,19 +169,19 @@ def check_row(profile: Profile, row: dict[str, Any], messages: list[MessageAtTic
         assert row["behaviour_policy"] in value("behaviour_policy", "text")
 
 
-def pose_of(profile: Profile, way: dict[str, MessageAtTick]) -> list[float]:
-    """Position of the base in the fixed frame, by these transforms to the frames' parents."""
+def pose_of(profile: Profile, transforms: dict[str, MessageAtTick]) -> list[float]:
+    """Return the base's position in the fixed frame; `transforms` lead to the parent frames."""
     assert profile.frames is not None
     point, frame = np.zeros(3), profile.frames.base
     while frame != profile.frames.fixed:
-        step = way[frame].fields
+        step = transforms[frame].fields
         rotation = rotations(*(np.array([step[f"rotation.{axis}"]]) for axis in "xyzw"))[0]
         point = rotation @ point + [step[f"translation.{axis}"] for axis in "xyz"]
         frame = step["parent"]
     return [float(part) for part in point[:2]]
 
 
-def test_what_does_not_fit_the_recording_is_refused():
+def test_mismatched_recording_or_profile_is_refused():
     with open_recording(SAMPLE) as recording:
         right = recording.recording_id
     where = {"recording_id": right, "tick": 3, "stamp_ns": 5}

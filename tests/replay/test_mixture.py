@@ -1,4 +1,4 @@
-"""Mixtures: what a file may say, how shares come about, and the weights against their boost."""
+"""Mixtures: valid files, how shares are computed, and the weights that correct a boost."""
 
 import json
 import re
@@ -65,7 +65,7 @@ from restock.replay.plan.weights import importance_weights
         ("not toml", "mixture"),
     ],
 )
-def test_what_a_mixture_may_not_say_is_refused(text, message):
+def test_invalid_mixtures_are_refused(text, message):
     with pytest.raises(ConfigError, match=message):
         parse_mixture(text)
 
@@ -87,16 +87,16 @@ SLIPS_ALONE = "[[strata]]\nname = 'nominal'\n[[strata]]\nname = 'wheel_slip'\n"
         ("where = 'step_index > 3) OR (true'\n" + EVERY, ConfigError, "brackets"),
         ("where = '(step_index > 3'\n" + EVERY, ConfigError, "`where`"),
         ("where = 'step_index > 3; SELECT 1'\n" + EVERY, ConfigError, "`where`"),
-        (EVERY + "[safety]\nunsafe = 'true'", MixtureError, "unsafe"),  # no row is left
-        (SLIPS_ALONE, MixtureError, "recovery"),  # whose rows belong to no stratum
+        (EVERY + "[safety]\nunsafe = 'true'", MixtureError, "unsafe"),  # leaves no row
+        (SLIPS_ALONE, MixtureError, "recovery"),  # rows of recovery are in no stratum
     ],
 )
-def test_what_rows_cannot_be_planned_by_is_refused(transitions, text, error, named):
+def test_mixtures_that_do_not_fit_rows_are_refused(transitions, text, error, named):
     with pytest.raises(error, match=re.escape(named)):
         planned(transitions, text)
 
 
-def test_rows_of_no_stratum_may_be_dropped(transitions):
+def test_rows_without_stratum_can_be_dropped(transitions):
     plan = planned(transitions, "unlisted = 'drop'\n" + SLIPS_ALONE)
     assert plan.left_out["in no stratum"] > 0
     assert sum(plan.left_out.values()) + len(plan.panel_rows) == len(transitions)
@@ -116,13 +116,13 @@ def test_rows_of_no_stratum_may_be_dropped(transitions):
         ("sum(reward) OVER (ROWS 3 PRECEDING) > 0", r"sum\(\) .*without ORDER BY"),
     ],
 )
-def test_sql_that_may_choose_other_rows_later_is_refused(transitions, sql, name):
+def test_nondeterministic_sql_is_refused(transitions, sql, name):
     for table in ("where", "[safety]\nunsafe", "[[strata]]\nname = 'x'\nwhere"):
         with pytest.raises(ConfigError, match=name):
             planned(transitions, f'{table} = "{sql}"\n{EVERY}')
 
 
-def test_sql_that_always_chooses_the_same_rows_is_taken(transitions):
+def test_deterministic_sql_is_accepted(transitions):
     sql = (
         "md5_number_lower(episode_id) % 10 < 9",
         "row_number() OVER (PARTITION BY episode_id ORDER BY transition_id) < 9",
@@ -138,7 +138,7 @@ def test_sql_that_always_chooses_the_same_rows_is_taken(transitions):
     assert len(planned(transitions, text + EVERY).panel_rows)
 
 
-def test_given_natural_and_equal_shares():
+def test_fixed_natural_and_equal_shares():
     def wanted(*given: object, **more: object) -> list[float]:
         rules = [StratumRule(name=str(i), share=s) for i, s in enumerate(given)]  # type: ignore[arg-type]
         counts = more.get("rows", [600, 300, 100])
@@ -148,13 +148,13 @@ def test_given_natural_and_equal_shares():
     assert wanted(0.4, "equal", "equal") == [0.4, 0.3, 0.3]
     assert wanted(0.2, "natural", "natural") == [0.2, 0.6, 0.2]
     assert wanted("natural", "natural", "natural") == [0.6, 0.3, 0.1]
-    # An equal part for each; the natural ones share theirs out by rows.
+    # Each gets an equal part; natural strata divide theirs by rows.
     assert wanted("equal", "natural", "natural") == [0.333333, 0.5, 0.166667]
     with pytest.raises(MixtureError, match=r"sum to 0\.9"):
         wanted(0.5, 0.3, 0.1)
 
 
-def test_the_surplus_of_a_capped_stratum_goes_to_the_others():
+def test_shortfall_is_redistributed_shrunk_or_refused():
     # 1,000 updates x 100 rows x 1/2 = 50,000 draws; 100 rows x 50 replays = 5,000: a share of 0.1.
     text = "max_replays_per_row = 50\nplanned_draws = 100_000\n" + EVERY
     rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
@@ -173,14 +173,14 @@ def test_the_surplus_of_a_capped_stratum_goes_to_the_others():
         plan_shares(
             parse_mixture("shortfall = 'refuse'\n" + text), rules, rows, episodes, draws=50_000
         )
-    # Where nobody can take the surplus, it cannot come from the logs.
+    # If no stratum can take the surplus, the logs' part of the batch shrinks.
     small = plan_shares(parse_mixture(text), rules, np.array([300, 100]), episodes, draws=50_000)
     assert small.scale == pytest.approx(0.4)
     np.testing.assert_allclose(small.got, [0.75, 0.25])
 
 
-def test_part_of_a_draw_is_planned_for_no_row(transitions):
-    # A run draws a row once where it may be drawn 1.5 times.
+def test_fractional_replay_limit_is_rounded_down(transitions):
+    # A run draws a row once if the limit is 1.5.
     text = (
         "max_replays_per_row = {}\nplanned_draws = 640\n[correction]\npost = 'none'\n"
         "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY
@@ -202,8 +202,8 @@ def test_strata_take_their_timing_from_conditions():
     assert resolve_strata(where, conditions)[0].timing == "post"  # the safe assumption
 
 
-def test_the_state_of_a_slip_is_nominal_if_nothing_was_known(transitions):
-    """Its row is weighted to the density of nominal rows, boosted or not: P(s'|s, a) stays."""
+def test_slip_rows_get_density_of_nominal_rows(transitions):
+    """Rows that hold only a slip are weighted to nominal density, so that P(s'|s, a) is kept."""
     full = "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
     plan = planned(transitions, full + "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
     names = [line.name for line in plan.strata]
@@ -223,7 +223,7 @@ def test_the_state_of_a_slip_is_nominal_if_nothing_was_known(transitions):
     )
 
 
-def test_clip_stands_between_none_and_full():
+def test_clipped_correction_is_between_none_and_full():
     code = np.repeat(np.array([0, 1], np.int16), [100, 9900])
     state = np.ones(10_000, np.int16)
     given = np.array([0.5, 0.5])
@@ -241,14 +241,14 @@ def test_clip_stands_between_none_and_full():
     assert ratio("clipped", clip=4.0) == pytest.approx(4)
 
 
-def test_the_plan_counts_replays(transitions):
+def test_plan_counts_replays(transitions):
     plan = planned(transitions, "planned_draws = 6400\n[sources]\nlogs = 0.25\n" + EVERY)
     draws = sum(line.replays_per_row * line.rows for line in plan.strata)
     assert draws == pytest.approx(100 * 64 * 0.25)
     assert plan.effective_rows == pytest.approx(len(plan.panel_rows), rel=1e-3)
 
 
-def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path, shell):
+def test_mix_verb_explains_packs_and_never_overwrites(store_path, tmp_path, shell):
     out = tmp_path / "panel"
     text = shell.out("mix", store_path, "--out", out, "--dry-run")
     assert "near_collision" in text
@@ -264,11 +264,11 @@ def test_the_verb_explains_then_packs_and_never_overwrites(store_path, tmp_path,
     assert "no --out" in shell.err("mix", store_path)
 
 
-def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, shell):
+def test_mix_verb_reports_planned_draws(store_path, tmp_path, shell):
     text = shell.out("mix", store_path, "--dry-run")
     assert "these numbers are for 2,560,000 draws of logged rows" in text
     assert "no row is drawn more than 400 times (max_replays_per_row)" in text
-    # Few rows: at the default training budget they bear less.
+    # So few rows cannot supply the default training budget.
     assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
     (tmp_path / "m.toml").write_text("planned_draws = 12_800\n[sources]\nlogs = 1\n" + EVERY)
     requested = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
@@ -277,7 +277,7 @@ def test_the_verb_says_what_replays_are_counted_over(store_path, tmp_path, shell
     assert "max_replays_per_row" not in text
 
 
-def test_the_page_explains_every_key():
+def test_docs_page_explains_every_key():
     page = (ROOT / "docs" / "mixture.md").read_text(encoding="utf-8")
     structs = (
         *(Mixture, StratumRule, EachCondition, EvaluationSplit, SourceShares, CorrectionRule),

@@ -1,4 +1,4 @@
-"""Which rows a mixture takes, by safety, version, caps, labels and store; and its schema."""
+"""The rows that a mixture selects, by safety, age, caps, labels and store."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.store.store import Store
 
 
-def taken(plan: PanelPlan) -> pa.Table:
+def selected_rows(plan: PanelPlan) -> pa.Table:
     return plan.rows.take(pa.array(plan.panel_rows))
 
 
-def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions):
+def test_rows_have_one_stratum_or_one_exclusion_reason(transitions):
     now = moment(int(transitions["stamp_ns"].to_numpy().max()))
     text = (
         f"max_rows_per_episode = 20\nas_of = {now}\nmax_age_days = 0.05\nwhere = 'action <> 4'\n"
@@ -31,19 +31,19 @@ def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions):
     )
     plan = planned(transitions, text)
     assert len(plan.left_out) == 5
-    assert 4 not in taken(plan)["action"].to_pylist()
+    assert 4 not in selected_rows(plan)["action"].to_pylist()
     assert sum(plan.left_out.values()) + len(plan.panel_rows) == len(transitions)
     assert sum(line.rows for line in plan.strata) == len(plan.panel_rows)
 
 
 @pytest.mark.parametrize("min_steps", [1, 2])
-def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(transitions, min_steps):
+def test_episode_strata_hold_whole_episodes(transitions, min_steps):
     plan = planned(
         transitions,
         "uncertain = 'keep'\n" + NO_SPLIT + by_priority(CONDITIONS, f"min_steps = {min_steps}\n"),
     )
-    assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
-    rows = taken(plan)
+    assert len(plan.panel_rows) == len(transitions)  # nominal takes the remaining rows
+    rows = selected_rows(plan)
     names = [line.name for line in plan.strata]
     stratum = dict(
         zip(
@@ -62,26 +62,26 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(transitions, mi
     assert {line.correction for line in plan.strata} == {"none"}
 
 
-def test_unsafe_rows_go_alone_or_with_their_episode(transitions):
+def test_unsafe_rows_or_their_episodes_are_left_out(transitions):
     bumped = set(transitions.filter(transitions["bumped"])["transition_id"].to_pylist())
     assert bumped
     rows = planned(transitions, NO_SPLIT + "[safety]\nunsafe = 'bumped'\n" + EVERY)
     assert rows.left_out == {"unsafe": len(bumped)}
-    assert not bumped & set(taken(rows)["transition_id"].to_pylist())
+    assert not bumped & set(selected_rows(rows)["transition_id"].to_pylist())
     whole = planned(
         transitions, NO_SPLIT + "[safety]\nunsafe = 'bumped'\nleave_out = 'episodes'\n" + EVERY
     )
     hit = set(transitions.filter(transitions["bumped"])["episode_id"].to_pylist())
-    assert not hit & set(taken(whole)["episode_id"].to_pylist())
+    assert not hit & set(selected_rows(whole)["episode_id"].to_pylist())
     assert whole.left_out["unsafe"] > len(bumped)
-    # A return may still span an unsafe step: what it cost is what is to be learnt.
+    # A return may still span an unsafe step, as its cost is to be learnt.
 
 
 @pytest.mark.parametrize("name", ["episode", "recording"])
-def test_caps_an_episode_and_recording_hold_in_each_stratum(transitions, name):
+def test_caps_per_episode_and_recording_hold_in_strata(transitions, name):
     text = f"max_rows_per_{name} = 7\n" + NO_SPLIT + EVERY
     plan = planned(transitions, text)
-    rows = taken(plan)
+    rows = selected_rows(plan)
     groups = pa.table({"group": rows[f"{name}_id"], "code": plan.stratum[plan.panel_rows]})
     assert (
         pc.max(
@@ -91,14 +91,14 @@ def test_caps_an_episode_and_recording_hold_in_each_stratum(transitions, name):
     )
     (reason,) = plan.left_out
     assert name in reason
-    # The same ones whatever the order of the rows; others with another seed.
+    # The order of the rows does not matter; the seed does.
     again = planned(transitions.take(pa.array(np.arange(len(transitions))[::-1])), text)
-    assert taken(again)["transition_id"].to_pylist() == rows["transition_id"].to_pylist()
+    assert selected_rows(again)["transition_id"].to_pylist() == rows["transition_id"].to_pylist()
     other = planned(transitions, "seed = 1\n" + text)
-    assert taken(other)["transition_id"].to_pylist() != rows["transition_id"].to_pylist()
+    assert selected_rows(other)["transition_id"].to_pylist() != rows["transition_id"].to_pylist()
 
 
-def test_rows_without_a_label_are_refused_dropped_or_nominal(transitions):
+def test_unlabelled_rows_are_refused_dropped_or_nominal(transitions):
     bare = np.arange(len(transitions)) < 50
     table = transitions
     for name in ("condition", "conditions"):
@@ -133,24 +133,24 @@ by = "none"
 
 @pytest.fixture
 def two_stores(tmp_path, store_path) -> Path:
-    """Return a folder with the store `other` of recordings 3 (also in the first), 7 and later 8."""
+    """Return a folder with store `other`: recordings 3 (also in the main store), 7, and later 8."""
     tables = [recording_transitions(index) for index in (3, 7, 8)]
     write_store(tmp_path / "other", tables)
     (tmp_path / "m.toml").write_text(OTHERS + EVERY)
     return tmp_path
 
 
-def test_a_store_whose_rows_are_all_in_the_first_one_is_named(tmp_path, store_path, shell):
+def test_store_contained_in_main_store_is_refused(tmp_path, store_path, shell):
     rows = recording_transitions(3)
     write_store(tmp_path / "other", [rows])
     mixture = tmp_path / "m.toml"
     mixture.write_text(OTHERS.replace("@1", "") + EVERY)
-    said = shell.err("mix", store_path, "--mixture", mixture, "--dry-run")
-    assert f"all {len(rows)} rows of 'twin' are also in the main store" in said
-    assert "leave this store out of the mixture" in said
+    err = shell.err("mix", store_path, "--mixture", mixture, "--dry-run")
+    assert f"all {len(rows)} rows of 'twin' are also in the main store" in err
+    assert "leave this store out of the mixture" in err
 
 
-def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_path, shell):
+def test_other_store_is_read_at_pinned_version(two_stores, store_path, shell):
     out = two_stores / "panel"
     words = ("mix", store_path, "--mixture", two_stores / "m.toml", "--out", out)
     document = shell.json(*words)
@@ -178,7 +178,7 @@ def test_another_store_is_drawn_from_at_its_pinned_version(two_stores, store_pat
     np.testing.assert_allclose(rows[:20], [by_id[i] for i in ids[:20].tolist()], rtol=1e-6)
 
 
-def test_a_run_draws_from_both_stores_by_their_shares(two_stores, store_path):
+def test_run_draws_from_stores_by_share(two_stores, store_path):
     text = OTHERS.replace('"other@1"', f'"{two_stores}/other@1"')
     panel = panel_of(store_path, text + EVERY, two_stores / "p")
     controller = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)
@@ -187,7 +187,7 @@ def test_a_run_draws_from_both_stores_by_their_shares(two_stores, store_path):
     assert controller.shares[twin].sum() == pytest.approx(1 / 3)
 
 
-def test_a_missing_other_store_is_named(store_path, tmp_path):
+def test_missing_other_store_is_reported(store_path, tmp_path):
     mixture = parse_mixture(OTHERS + EVERY)
     with Store(store_path) as store:
         with pytest.raises(StoreError, match=r"the mixture's store 'twin': no such store"):
@@ -196,9 +196,9 @@ def test_a_missing_other_store_is_named(store_path, tmp_path):
             plan_panel(store.connection, mixture, store.conditions())
 
 
-def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions):
+def test_uncertain_rows_are_kept_dropped_or_nominal(transitions):
     labels = transitions["conditions"].to_pylist()
-    # Every third slip, and some rows that are labelled as nothing, may be a slip or not.
+    # Every third slip, and some rows without a condition, are uncertain.
     slips = [i for i, held in enumerate(labels) if held == ["wheel_slip"]]
     doubtful = {*slips[::3], *[i for i, held in enumerate(labels) if not held][:40]}
     assert len(slips[::3]) > 3
@@ -206,7 +206,7 @@ def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions):
     field = pa.field("uncertain", pa.list_(pa.string()))
     values = [["wheel_slip"] if row in doubtful else [] for row in range(len(labels))]
     table = transitions.set_column(place, field, pa.array(values, field.type))
-    table = table.set_column(  # and the label decides nothing where there is no such rule
+    table = table.set_column(  # null in rows without such a rule
         place, field, pa.array([None if i % 7 == 0 and not v else v for i, v in enumerate(values)])
     )
 
@@ -220,9 +220,9 @@ def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions):
     assert plan.left_out == {}
     assert rows["wheel_slip"] == before["wheel_slip"] - len(slips[::3])
     assert rows["nominal"] == before["nominal"] + len(slips[::3])
-    # What the panel says of a row is what the store says.
+    # The panel keeps the store's condition of a row.
     by_id = dict(zip(transitions["transition_id"].to_pylist(), labels, strict=True))
-    condition = taken(plan).select(["transition_id", "condition"]).to_pylist()
+    condition = selected_rows(plan).select(["transition_id", "condition"]).to_pylist()
     assert sum(row["condition"] == "wheel_slip" for row in condition) >= len(slips)
     assert all(row["condition"] in [*by_id[row["transition_id"]], "nominal"] for row in condition)
     plan, rows = planned_as("uncertain = 'drop'\n")
@@ -232,8 +232,8 @@ def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions):
     assert planned(older, "uncertain = 'drop'\n" + NO_SPLIT + EVERY).left_out == {}
 
 
-def test_a_condition_that_never_holds_long_keeps_its_episodes(transitions):
-    """No episode has so many steps: those with the most count."""
+def test_unreachable_min_steps_selects_longest_episodes(transitions):
+    """If no episode has `min_steps` steps of a condition, those with the most are selected."""
     labels = transitions.select(["episode_id", "conditions"]).to_pylist()
     steps: dict[str, int] = {}
     for row in labels:
@@ -243,4 +243,4 @@ def test_a_condition_that_never_holds_long_keeps_its_episodes(transitions):
     most = {episode for episode, count in steps.items() if count == max(steps.values())}
     text = "unlisted = 'drop'\n[[strata]]\nname = 'near_collision'\nunit = 'episode'\nmin_steps = "
     plan = planned(transitions, text + f"{max(steps.values()) + 5}\n" + NO_SPLIT)
-    assert set(taken(plan)["episode_id"].to_pylist()) == most
+    assert set(selected_rows(plan)["episode_id"].to_pylist()) == most

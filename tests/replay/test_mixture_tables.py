@@ -1,4 +1,4 @@
-"""`mixture(name)` and `mixture_rows(name)`: a plan in SQL, and `restock mix` packs just that."""
+"""`mixture(name)` and `mixture_rows(name)` in SQL: the plan that `restock mix` packs."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ MIXTURES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """`store`, whose first recording has no labels in some rows, and `other`."""
+    """Return a folder with `store`, `other`, and `half`, some of whose rows have no labels."""
     path = tmp_path_factory.mktemp("stores")
     first = recording_transitions(1)
     bare = [None if row < 30 else held for row, held in enumerate(first["conditions"].to_pylist())]
@@ -45,7 +45,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("name", one_in(2, MIXTURES))
-def test_mix_packs_exactly_what_the_tables_say(folder, tmp_path, name):
+def test_mix_packs_rows_of_mixture_tables(folder, tmp_path, name):
     text, mixture = MIXTURES[name], name
     if text is not None:
         mixture = str(folder / "mixture.toml")
@@ -74,7 +74,7 @@ def test_mix_packs_exactly_what_the_tables_say(folder, tmp_path, name):
     assert counted == {line["stratum"]: line["count_all"] for line in rows_of}
 
 
-def test_a_file_that_changed_is_planned_again(folder, tmp_path):
+def test_changed_mixture_file_is_planned_again(folder, tmp_path):
     path = tmp_path / "m.toml"
     path.write_text("seed = 1\n" + EVERY)
     with Store(folder / "store") as store:
@@ -86,7 +86,7 @@ def test_a_file_that_changed_is_planned_again(folder, tmp_path):
         assert store.sql(query).fetchall() != first
 
 
-def test_the_verb_answers_of_a_version_and_joins(folder, shell):
+def test_mixture_tables_follow_version_and_join(folder, shell):
     store = str(folder / "store")
     query = (
         "SELECT stratum, any_value(m.rows) AS rows, count(*) AS packed"
@@ -109,13 +109,13 @@ def test_the_verb_answers_of_a_version_and_joins(folder, shell):
         ("{folder}/refused.toml", "of the gradient after weights"),
     ],
 )
-def test_what_cannot_be_mixed_is_refused_as_by_mix(folder, name, message, shell):
+def test_invalid_mixtures_are_refused(folder, name, message, shell):
     (folder / "wrong.toml").write_text("seeed = 1\n" + EVERY)
     (folder / "refused.toml").write_text(
         "[correction]\npost = 'full'\n[each_condition]\nshare = 'equal'\n"
     )
     name = name.format(folder=folder)
     for macro in ("mixture", "mixture_rows"):
-        said = shell.err("sql", folder / "store", f"FROM {macro}('{name}')")
-        assert message in said
-        assert "UDF" not in said
+        err = shell.err("sql", folder / "store", f"FROM {macro}('{name}')")
+        assert message in err
+        assert "UDF" not in err

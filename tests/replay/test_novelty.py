@@ -1,4 +1,4 @@
-"""Novelty: rows far from other episodes are found, without labels; `novel` is a stratum."""
+"""Novelty: rows far from other episodes are found without labels; `novel` is a stratum."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOVEL = "[[strata]]\nname = 'novel'\nshare = 0.3\n[each_condition]\nshare = 'nat
 
 
 def crowded(recording: int, *, seed: int = 0, **given: object) -> pa.Table:
-    """Rows whose observations are all near one point."""
+    """Return rows whose observations are all near one point."""
     table = recording_transitions(recording, seed=seed, **given)  # type: ignore[arg-type]
     size = len(table["observation"][0])
     near = np.random.default_rng([seed, recording]).normal(0.5, 0.01, (len(table), size))
@@ -50,7 +50,7 @@ def read(store: Store | Path, text: str = "FROM novelty") -> list[dict[str, obje
     return store.sql(text).to_arrow_table().to_pylist()
 
 
-def test_planted_rows_are_the_strangest_and_say_why(tmp_path):
+def test_planted_rows_rank_first_with_reason(tmp_path):
     table = crowded(1)
     planted = np.array([40, 160])
     slip = TASK.observation_names.index("slip_speed")
@@ -66,8 +66,8 @@ def test_planted_rows_are_the_strangest_and_say_why(tmp_path):
     assert listed_rows(store) == rows
 
 
-def test_rows_of_the_own_episode_do_not_count(tmp_path):
-    """A long episode of equal rows is as strange as one row of it."""
+def test_rows_of_same_episode_do_not_count(tmp_path):
+    """A long episode of equal rows is as novel as one of its rows."""
     table = crowded(1)
     episode = np.asarray(table["episode_index"]) == 3
     store = write_store(tmp_path / "store", [moved(table, episode, 0, 9.0), crowded(2)])
@@ -77,7 +77,7 @@ def test_rows_of_the_own_episode_do_not_count(tmp_path):
     assert max(row["novelty"] for row in found if not row["far"]) < 1
 
 
-def test_it_is_the_mean_distance_to_the_nearest(tmp_path):
+def test_novelty_is_mean_distance_to_nearest_rows(tmp_path):
     tables = [recording_transitions(number) for number in (1, 2)]
     rows = pa.concat_tables(tables).sort_by("transition_id")
     assert len(rows) < REFERENCE  # so all rows are the reference
@@ -91,7 +91,7 @@ def test_it_is_the_mean_distance_to_the_nearest(tmp_path):
     np.testing.assert_allclose([row["novelty"] for row in found], expected, rtol=1e-5)
 
 
-def test_compaction_and_order_of_files_change_nothing(tmp_path):
+def test_novelty_ignores_compaction_and_file_order(tmp_path):
     tables = [recording_transitions(number, episodes=40) for number in (1, 2, 3)]
     one = write_store(tmp_path / "one", tables)
     other = write_store(tmp_path / "other", tables[::-1])
@@ -103,7 +103,7 @@ def test_compaction_and_order_of_files_change_nothing(tmp_path):
     assert read(one) == before
 
 
-def test_memory_is_bounded_by_the_reference():
+def test_memory_is_bounded_by_reference_size():
     rows, size = 20_000, 8
     rng = np.random.default_rng(0)
     given = rng.normal(size=(rows, size)).astype(np.float32)
@@ -119,7 +119,7 @@ def test_memory_is_bounded_by_the_reference():
     assert peak < 4 * rows * REFERENCE / 4  # a quarter of all distances
 
 
-def test_it_is_measured_once_for_the_same_files(tmp_path, monkeypatch):
+def test_novelty_is_measured_once_per_file_set(tmp_path, monkeypatch):
     store = write_store(tmp_path / "store", [recording_transitions(1)])
     measured = []
     measure = novelty.read_novelty
@@ -137,7 +137,7 @@ def test_it_is_measured_once_for_the_same_files(tmp_path, monkeypatch):
     assert read(Path(f"{store}@0")) == first  # an older version is measured by its own rows
 
 
-def test_what_cannot_be_measured_is_null(tmp_path, shell):
+def test_novelty_is_null_if_unmeasurable(tmp_path, shell):
     store = write_store(tmp_path / "store", [recording_transitions(1, episodes=1)])
     assert {(row["novelty"], row["novel"]) for row in read(store)} == {(None, None)}
     assert listed_rows(store) == []
@@ -145,7 +145,7 @@ def test_what_cannot_be_measured_is_null(tmp_path, shell):
     assert shell.json("coverage", store)[-1]["rows_held"] == 0
 
 
-def test_tasks_are_compared_with_themselves(tmp_path):
+def test_novelty_is_measured_within_task(tmp_path):
     wide = Task(TASK.body, TASK.actions, sectors=8)
     store = write_store(tmp_path / "store", [crowded(1)])
     write_store(store, [crowded(2, task=wide), crowded(3, task=wide)], task=wide)
@@ -157,7 +157,7 @@ def test_tasks_are_compared_with_themselves(tmp_path):
         assert int(row["novel"]) == pytest.approx(row["n"] * novelty.NOVEL_SHARE, abs=1)
 
 
-def test_the_rows_of_every_store_of_a_mixture_are_measured(tmp_path):
+def test_novelty_covers_every_store_of_mixture(tmp_path):
     write_store(tmp_path / "other", [crowded(7)])
     store = write_store(tmp_path / "store", [crowded(1), crowded(2)])
     other = f"[[sources.stores]]\nname = 'other'\npath = '{tmp_path}/other'\nshare = 0.2\n"
@@ -173,7 +173,7 @@ def test_the_rows_of_every_store_of_a_mixture_are_measured(tmp_path):
         ("[[strata]]\nname = 'far'\nwhere = 'novelty > zone'\nshare = 1.0\n", "does not run"),
     ],
 )
-def test_wrong_strata_are_refused(store_path, tmp_path, text, problem):
+def test_invalid_strata_are_refused(store_path, tmp_path, text, problem):
     with pytest.raises(ConfigError, match=re.escape(problem)):
         panel_of(store_path, text, tmp_path / "panel")
     with pytest.raises(RunError, match="is not a run or a store"):
@@ -187,7 +187,7 @@ def sample(tmp_path_factory) -> Path:
     return store
 
 
-def test_it_ranks_what_the_rules_of_the_sample_logs_name(sample):
+def test_labelled_conditions_have_high_novelty(sample):
     rows = read(
         sample, "SELECT conditions, novelty FROM transitions JOIN novelty USING (transition_id)"
     )
@@ -198,7 +198,7 @@ def test_it_ranks_what_the_rules_of_the_sample_logs_name(sample):
         assert area > 0.8, condition
 
 
-def test_a_quota_on_novel_rows_is_mixed_from_the_sample_logs(sample, tmp_path, shell):
+def test_novel_quota_is_mixed_from_sample_logs(sample, tmp_path, shell):
     mixture = str(tmp_path / "mixture.toml")
     Path(mixture).write_text("max_replays_per_row = 400\n" + NO_SPLIT + NOVEL)
     assert cli.main(["mix", str(sample), "--mixture", mixture, "--out", str(tmp_path / "p")]) == 0
@@ -211,14 +211,14 @@ def test_a_quota_on_novel_rows_is_mixed_from_the_sample_logs(sample, tmp_path, s
     assert 0 < counted["rows"] == counted["novel"]
     *_, line = shell.json("coverage", sample)
     assert line["condition"] == "novel"
-    # Rows that hold a condition have its stratum, and one too near to call counts as not held.
+    # Rows with a condition are in its stratum; an uncertain condition does not count.
     assert line["nominal_rows"] <= counted["rows"] < line["rows_held"]
     gaps = shell.json("coverage", "gaps", sample, "--mixture", mixture)["gaps"]
     (gap,) = [gap for gap in gaps if gap["asked_by"] == f"mixture {mixture}"]
     assert (gap["cell"], gap["there"], gap["rate"] > 0) == ("novel", counted["rows"], True)
 
 
-def test_the_page_of_coverage_lists_the_strangest(sample, tmp_path):
+def test_coverage_page_lists_most_novel_rows(sample, tmp_path):
     page = tmp_path / "page.html"
     assert cli.main(["coverage", str(sample), "--out", str(page)]) == 0
     text = page.read_text(encoding="utf-8")

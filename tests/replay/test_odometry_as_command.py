@@ -1,4 +1,4 @@
-"""Recordings whose action is the measured motion: said at ingest, audited, in no panel unasked."""
+"""Odometry in place of commands is reported, audited, and left out of panels by default."""
 
 from pathlib import Path
 
@@ -23,17 +23,17 @@ fields = { speed_mps = "twist.twist.linear.x", yaw_rate_radps = "twist.twist.ang
 
 @pytest.fixture(scope="module")
 def profiles(tmp_path_factory) -> tuple[Path, Path, Path]:
-    """Return the bags' folder, a profile by commands, and the same task by odometry."""
+    """Return the folder of the bags, a profile that reads commands, and one that reads odometry."""
     folder = tmp_path_factory.mktemp("odometry")
     write_bag(Drive(), folder / "commanded")
     write_bag(Drive(duration_s=9.0), folder / "measured")
-    reported, seen = folder / "told.toml", folder / "seen.toml"
-    assert main(["profile", "new", str(folder / "commanded"), "--out", str(reported)]) == 0
-    text = reported.read_text()
+    by_command, by_odometry = folder / "commands.toml", folder / "odometry.toml"
+    assert main(["profile", "new", str(folder / "commanded"), "--out", str(by_command)]) == 0
+    text = by_command.read_text()
     assert TWIST in text
-    swapped = text.replace(TWIST, MEASURED).replace('name = "told"', 'name = "seen"')
-    seen.write_text(swapped.replace('steps = "command"', 'steps = "rate"'))
-    return folder, reported, seen
+    swapped = text.replace(TWIST, MEASURED).replace('name = "commands"', 'name = "odometry"')
+    by_odometry.write_text(swapped.replace('steps = "command"', 'steps = "rate"'))
+    return folder, by_command, by_odometry
 
 
 def ingested(folder: Path, recording: str, profile: Path, store: Path, shell) -> dict:
@@ -47,12 +47,12 @@ def mixture(folder: Path, more: str = "") -> tuple[str, Path]:
     return "--mixture", folder / "mix.toml"
 
 
-def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, shell):
-    folder, reported, seen = profiles
+def test_panels_leave_out_and_count_odometry_actions(profiles, tmp_path, shell):
+    folder, by_command, by_odometry = profiles
     store, panel = tmp_path / "store", tmp_path / "panel"
-    first = ingested(folder, "commanded", reported, store, shell)
+    first = ingested(folder, "commanded", by_command, store, shell)
     assert {"input": "command", "instead": INSTEAD} not in first["stand_ins"]
-    second = ingested(folder, "measured", seen, store, shell)
+    second = ingested(folder, "measured", by_odometry, store, shell)
     assert {"input": "command", "instead": INSTEAD} in second["stand_ins"]
     words = ("mix", store, *mixture(tmp_path))
     left_out = {"odometry in place of a command": second["transitions"]}
@@ -65,10 +65,10 @@ def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, sh
     assert [row["source_file"] for row in found["sample"]] == [str(folder / "measured")]
 
 
-def test_a_store_of_measured_actions_alone_makes_no_panel(profiles, tmp_path, shell):
-    folder, _, seen = profiles
+def test_store_of_odometry_actions_alone_is_refused(profiles, tmp_path, shell):
+    folder, _, by_odometry = profiles
     store = tmp_path / "store"
-    recording = ["ingest", str(folder / "measured"), "--profile", str(seen)]
+    recording = ["ingest", str(folder / "measured"), "--profile", str(by_odometry)]
     assert f"no command: {INSTEAD}" in shell.out(*recording, "--store", store)
     err = shell.err("mix", store, *mixture(tmp_path), "--dry-run")
     assert "the action of every transition is odometry" in err

@@ -1,4 +1,4 @@
-"""A store makes the views and macros that a query names, and what they are made of."""
+"""A store creates the views and macros that a query names, and those they depend on."""
 
 import re
 
@@ -13,13 +13,13 @@ from restock.replay.store.store import Store
 _LISTED = "SELECT view_name FROM duckdb_views() WHERE NOT internal"
 
 
-def made(store: Store) -> set[str]:
+def created_views(store: Store) -> set[str]:
     """Return the views that a store's connection has."""
     return {name for (name,) in store.bare.execute(_LISTED).fetchall()}
 
 
 @pytest.mark.parametrize("every", one_in(2, [8, 1]))
-def test_every_view_and_macro_can_be_named_alone(store_path, every):
+def test_every_view_and_macro_works_alone(store_path, every):
     text = definitions(names=[*VIEWS, *MACROS])
     views = re.findall(r"CREATE OR REPLACE VIEW (\w+)", text)
     assert {"events", "coverage_by_week", "drift", "signal_weeks"} <= set(views)
@@ -28,25 +28,25 @@ def test_every_view_and_macro_can_be_named_alone(store_path, every):
             store.sql(f'FROM "{view.upper()}" LIMIT 1').fetchall()
     for macro in re.findall(r"CREATE OR REPLACE MACRO (\w+)", text)[::every]:
         with Store(store_path) as store:
-            install_named(store.bare, macro)  # bound when it is made
+            install_named(store.bare, macro)  # bound when it is created
     with Store(store_path) as store:
         store.sql("FROM drift_by('month')").fetchall()
 
 
-def test_a_query_has_made_what_it_names_and_no_more(store_path):
+def test_query_creates_only_views_it_needs(store_path):
     with Store(store_path) as store:
-        assert not made(store) & {"transitions", "recordings", "coverage"}
+        assert not created_views(store) & {"transitions", "recordings", "coverage"}
         store.sql("SELECT count(*) FROM Transitions").fetchall()
-        assert "transitions" in made(store)
-        assert not made(store) & {"coverage", "coverage_by_condition", "held_conditions"}
+        assert "transitions" in created_views(store)
+        assert not created_views(store) & {"coverage", "coverage_by_condition", "held_conditions"}
         store.sql("FROM missing_cells").fetchall()
-        assert {"held_conditions", "conditions", "actions"} <= made(store)
+        assert {"held_conditions", "conditions", "actions"} <= created_views(store)
     with Store(store_path) as store:
         common = {"transitions", "episodes", "coverage", "label_scores", "corrections"}
         assert common <= {name for (name,) in store.connection.execute(_LISTED).fetchall()}
 
 
-def test_a_computed_name_is_found_and_a_misspelt_one_corrected(store_path):
+def test_computed_and_misspelt_view_names(store_path):
     with Store(store_path) as store:
         rows = store.sql("FROM query_table('cover' || 'age')").fetchall()
         assert rows == store.sql("FROM coverage").fetchall()
@@ -54,7 +54,7 @@ def test_a_computed_name_is_found_and_a_misspelt_one_corrected(store_path):
         store.sql("FROM rewardmix")
 
 
-def test_what_a_query_makes_itself_is_left_as_it_is(store_path):
+def test_views_created_by_query_are_kept(store_path):
     with Store(store_path) as store:
         store.sql("CREATE OR REPLACE VIEW drops AS SELECT 'mine' AS reason; FROM drops")
         assert store.sql("SELECT reason FROM drops").fetchall() == [("mine",)]
@@ -62,7 +62,7 @@ def test_what_a_query_makes_itself_is_left_as_it_is(store_path):
 
 
 @pytest.mark.long
-def test_lists_of_views_have_all_of_them(store_path):
+def test_view_listings_are_complete(store_path):
     for text in (
         "SELECT DISTINCT view FROM columns",
         "SELECT table_name FROM information_schema.tables",

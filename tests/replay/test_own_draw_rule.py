@@ -1,4 +1,4 @@
-"""A draw rule of your own, one class and one row of RULES, draws everywhere that rows are drawn."""
+"""A custom draw rule: one class and one row of RULES."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def recent_panel(tmp_path, monkeypatch) -> Panel:
     return panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")
 
 
-def test_a_sampler_draws_by_it(recent_panel):
+def test_sampler_draws_by_custom_rule(recent_panel):
     sampler, stamps = sampler_for(recent_panel, 64, seed=0), recent_panel.meta_column("stamp_ns")
     drawn = [sampler.draw() for _ in range(50)]
     rows = np.concatenate([one.rows for one in drawn])
@@ -47,6 +47,6 @@ def test_a_sampler_draws_by_it(recent_panel):
             assert stamps[of_stratum].min() >= newest.min()
 
 
-def test_a_rule_that_nobody_made_is_refused(tmp_path):
+def test_unknown_rule_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="the rules are uniform, without_replacement, per"):
         panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")

@@ -1,4 +1,4 @@
-"""The file of packed rows: whatever order their parts come in, the same bytes and checksum."""
+"""The file of packed rows: the same bytes and checksum for any order of writing."""
 
 import errno
 import os
@@ -26,7 +26,7 @@ def small_blocks(patch: pytest.MonkeyPatch, held_blocks: int) -> None:
 
 @settings(max_examples=40)
 @given(st.integers(1, 90), st.integers(0, 4), st.integers(0, 2**32), st.integers(1, 40))
-def test_parts_in_any_order_make_the_same_file(tmp_path_factory, count, held, seed, at_once):
+def test_parts_in_any_order_give_same_file(tmp_path_factory, count, held, seed, at_once):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(count, WIDTH)).astype("<f4")
     path = tmp_path_factory.mktemp("packed") / "rows"
@@ -49,7 +49,7 @@ def test_parts_in_any_order_make_the_same_file(tmp_path_factory, count, held, se
     record.check(path, verify=True)
 
 
-def test_every_changed_byte_is_found(tmp_path):
+def test_changed_bytes_are_found(tmp_path):
     content = np.random.default_rng(0).bytes(4 * 100 + 7)
     path = tmp_path / "file"
     path.write_bytes(content)
@@ -61,7 +61,7 @@ def test_every_changed_byte_is_found(tmp_path):
             record.check(path, verify=True)
 
 
-def test_a_row_that_never_came_is_an_error(tmp_path):
+def test_missing_row_is_refused(tmp_path):
     rows = np.zeros((20, WIDTH), np.float32)
     with PackedFile(tmp_path / "rows", 20, WIDTH, parts=2) as file:
         file.put(np.arange(20), Values(HALVES[0], rows[:, HALVES[0]]))
@@ -70,7 +70,7 @@ def test_a_row_that_never_came_is_an_error(tmp_path):
             file.finish()
 
 
-def test_a_full_disk_is_said_by_whoever_fills_it(tmp_path, monkeypatch):
+def test_full_disk_is_reported(tmp_path, monkeypatch):
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 

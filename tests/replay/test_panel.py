@@ -1,4 +1,4 @@
-"""Panels: rows equal to the store's, n-step returns, pinned, checked, all or nothing."""
+"""Panels: rows of their store, n-step returns, ids, checksums, and builds all or nothing."""
 
 import hashlib
 import json
@@ -47,7 +47,7 @@ def by_episode(table: pa.Table) -> dict[str, list[dict[str, object]]]:
 
 
 @pytest.mark.parametrize("n_step", [1, 3, 7])
-def test_packed_rows_are_those_of_a_naive_reading(transitions, tmp_path, n_step):
+def test_packed_rows_match_naive_computation(transitions, tmp_path, n_step):
     # Shuffled, because a store's files come in any order; and with a step missing.
     order = np.random.default_rng(0).permutation(len(transitions))
     shuffled = transitions.take(pa.array(order)).filter(
@@ -93,27 +93,27 @@ def handed_over(table: pa.Table) -> pa.Table:
     )
 
 
-def test_returns_stop_at_a_handover(tmp_path):
+def test_returns_stop_at_handover(tmp_path):
     table = handed_over(recording_transitions(1, episodes=1))
     panel = build_panel(table, uniform(n_step=4), tmp_path / "p")
     assert panel.meta["horizon"].to_pylist()[:6] == [4, 4, 3, 2, 1, 4]
 
 
-def test_returns_stop_before_an_action_less_likely_than_chance(tmp_path):
+def test_returns_stop_before_unlikely_actions(tmp_path):
     table = recording_transitions(1, episodes=1)
-    # Five actions: chance is 0.2. The step that explored is the first of its own return.
+    # Five actions: chance is 0.2. An exploring step can only be the first of its return.
     probability = np.where(np.arange(len(table)) == 5, 0.1, 0.9)
     probability[7] = 0.2
     table = replaced(table, {"action_probability": probability})
     panel = build_panel(table, uniform(n_step=4), tmp_path / "p", task=TASK)
     assert panel.meta["horizon"].to_pylist()[:8] == [4, 4, 3, 2, 1, 4, 4, 4]
-    # Without the task nobody knows what chance is.
+    # Without the task, chance is unknown.
     blind = build_panel(table, uniform(n_step=4), tmp_path / "q")
     assert blind.meta["horizon"].to_pylist()[:8] == [4] * 8
 
 
 @pytest.mark.parametrize("whole_file", [True, False])
-def test_small_stretches_and_batches_pack_the_same_bytes(tmp_path, monkeypatch, whole_file):
+def test_small_batches_pack_same_bytes(tmp_path, monkeypatch, whole_file):
     tables = [recording_transitions(index, episodes=90) for index in (3, 1, 2)]
     table = pa.concat_tables(tables)  # some 9,000 rows, more than DuckDB gives at a time
     if not whole_file:
@@ -138,7 +138,7 @@ def test_small_stretches_and_batches_pack_the_same_bytes(tmp_path, monkeypatch, 
     assert held[0].to_pylist() == held[1].to_pylist()
 
 
-def test_ids_that_no_ingest_gave_find_their_rows_too(transitions, tmp_path):
+def test_arbitrary_transition_ids_are_accepted(transitions, tmp_path):
     # Ids of three recordings mixed: the runs of rising ids overlap.
     ids = np.random.default_rng(1).permutation(len(transitions))
     panel = build_panel(replaced(transitions, {"transition_id": ids}), uniform(), tmp_path / "p")
@@ -146,7 +146,7 @@ def test_ids_that_no_ingest_gave_find_their_rows_too(transitions, tmp_path):
     np.testing.assert_array_equal(panel.rows, plain.rows)
 
 
-def test_a_row_that_is_no_number_is_refused(transitions, tmp_path):
+def test_non_finite_row_is_refused(transitions, tmp_path):
     rows = transitions["next_observation"].to_pylist()
     rows[7] = [float("nan"), *rows[7][1:]]
     table = replaced(transitions, {"next_observation": rows})
@@ -156,7 +156,7 @@ def test_a_row_that_is_no_number_is_refused(transitions, tmp_path):
     assert len(build_panel(table, uniform(where=where), tmp_path / "p")) == len(table) - 1
 
 
-def test_a_store_and_the_same_table_pack_the_same_rows(transitions, store_path, tmp_path):
+def test_store_and_table_pack_same_rows(transitions, store_path, tmp_path):
     mixture = load_mixture("coverage")
     from_table = build_panel(transitions, mixture, tmp_path / "a", task=TASK)
     from_store = panel_of(store_path, mixture, tmp_path / "b")
@@ -165,27 +165,27 @@ def test_a_store_and_the_same_table_pack_the_same_rows(transitions, store_path, 
     assert from_store.task == TASK
     assert from_store.task_hash == TASK.hash
     assert from_store.store_version == 2
-    assert from_store.header.profile == "warehouse_amr"  # by whose name training finds its task
+    assert from_store.header.profile == "warehouse_amr"  # training finds the task by this name
     assert from_table.header.profile == ""
 
 
-def test_the_id_names_the_content_and_the_packing(transitions, tmp_path, monkeypatch):
-    def made(name: str, **changes: object) -> str:
+def test_id_depends_on_content_and_packing_version(transitions, tmp_path, monkeypatch):
+    def id_of(name: str, **changes: object) -> str:
         return build_panel(transitions, uniform(**changes), tmp_path / name).id
 
-    first = made("a")
-    assert made("b") == first
-    of_others = {made("c", n_step=2), made("d", seed=1, by="episode")}
-    of_others.add(made("e", seed=2, by="episode"))
+    first = id_of("a")
+    assert id_of("b") == first
+    other_ids = {id_of("c", n_step=2), id_of("d", seed=1, by="episode")}
+    other_ids.add(id_of("e", seed=2, by="episode"))
     for module in (build, panel_module):
         monkeypatch.setattr(module, "PACKING_VERSION", PACKING_VERSION + 1)
-    of_others.add(made("f"))
-    assert len(of_others | {first}) == 5
-    with pytest.raises(PanelError, match="make it again"):  # of another version of Restock
+    other_ids.add(id_of("f"))
+    assert len(other_ids | {first}) == 5
+    with pytest.raises(PanelError, match="make it again"):  # packed by another version of Restock
         Panel.open(tmp_path / "a")
 
 
-def test_rows_of_two_tasks_are_refused_unless_one_is_chosen(tmp_path):
+def test_rows_of_two_tasks_need_filter(tmp_path):
     other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     write_store(path, [recording_transitions(2, task=other)], task=other)
@@ -198,7 +198,7 @@ def test_rows_of_two_tasks_are_refused_unless_one_is_chosen(tmp_path):
     assert panel.observation_size == other.observation_size
 
 
-def test_a_panel_that_is_there_is_kept_unless_forced(transitions, tmp_path):
+def test_existing_panel_is_kept_unless_forced(transitions, tmp_path):
     first = build_panel(transitions, uniform(), tmp_path / "p")
     (tmp_path / "mine").mkdir()
     for out, force in (("p", False), ("mine", True), ("p/other", False)):
@@ -214,7 +214,7 @@ def test_a_panel_that_is_there_is_kept_unless_forced(transitions, tmp_path):
     assert (tmp_path / "p" / "notes.txt").read_text() == "mine"
 
 
-def test_an_interruption_leaves_nothing(transitions, tmp_path, monkeypatch):
+def test_interrupted_build_leaves_nothing(transitions, tmp_path, monkeypatch):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -224,7 +224,7 @@ def test_an_interruption_leaves_nothing(transitions, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_builder_of_the_same_panel_does_not_collide(transitions, tmp_path, monkeypatch):
+def test_slower_of_two_builders_is_refused(transitions, tmp_path, monkeypatch):
     write_meta = pack.Packer.write_meta
 
     def meanwhile(*args: Path) -> None:
@@ -239,7 +239,7 @@ def test_another_builder_of_the_same_panel_does_not_collide(transitions, tmp_pat
     Panel.open(tmp_path / "p", verify=True)
 
 
-def test_a_killed_build_leaves_nothing_in_the_way(transitions, tmp_path):
+def test_killed_build_does_not_block_next(transitions, tmp_path):
     table = tmp_path / "rows.parquet"
     pq.write_table(transitions, table)
     code = (
@@ -270,8 +270,8 @@ share = "equal"
 """
 
 
-def test_packing_gives_the_bytes_of_its_version(transitions, tmp_path):
-    """Check the packed bytes: whoever changes them raises PACKING_VERSION and these values."""
+def test_packed_bytes_match_packing_version(transitions, tmp_path):
+    """Check the packed bytes: if they change, raise PACKING_VERSION and update the values here."""
     panel = build_panel(
         transitions, parse_mixture(GOLDEN), tmp_path / "p", task=TASK, conditions=CONDITIONS
     )
@@ -289,14 +289,14 @@ def changed(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
 
-def test_damage_is_found(transitions, tmp_path, shell):
+def test_damaged_panel_is_refused(transitions, tmp_path, shell):
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     rows, header = panel.path / ROWS, panel.path / "panel.json"
     assert not rows.stat().st_mode & 0o222
     assert panel.id in shell.err("store", "verify", panel.path, code=0)
     good, text = rows.read_bytes(), header.read_bytes()
     between = bytearray(good)
-    between[6000] ^= 1  # between two of the blocks that every opening looks at
+    between[6000] ^= 1  # between two of the blocks that opening a panel checks
     changed(rows, bytes(between))
     Panel.open(panel.path)
     assert str(rows) in "".join(shell.err("store", "verify", panel.path).split())
@@ -320,7 +320,7 @@ def test_damage_is_found(transitions, tmp_path, shell):
         Panel.open(tmp_path / "nowhere")
 
 
-def test_rows_cannot_be_written(transitions, tmp_path):
+def test_panel_rows_are_read_only(transitions, tmp_path):
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     with pytest.raises(ValueError, match="read-only"):
         panel.rows[0, 0] = 1.0
@@ -348,9 +348,9 @@ with Store(sys.argv[1], memory_limit="110MB") as store:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
-def test_a_store_several_times_the_memory_is_packed(tmp_path):
+def test_store_larger_than_memory_is_packed(tmp_path):
     task = Task(body=TASK.body, actions=TASK.actions, sectors=76)
-    limit = 480 << 20  # bytes more than the process has once its store is open
+    limit = 480 << 20  # bytes beyond those of the process with an open store
     first = recording_transitions(1, episodes=1500, task=task)
     recordings = []
     for number in range(1, 17):
@@ -382,7 +382,7 @@ def test_a_store_several_times_the_memory_is_packed(tmp_path):
         np.testing.assert_array_equal(panel.rows[row, panel.columns["observation"]], expected)
 
 
-def test_tables_of_something_else_are_refused_by_column(transitions, tmp_path):
+def test_invalid_tables_are_refused(transitions, tmp_path):
     texts = pa.array(["1"] * len(transitions))
     place = transitions.column_names.index
     for table, named in (
@@ -391,14 +391,14 @@ def test_tables_of_something_else_are_refused_by_column(transitions, tmp_path):
         (transitions.drop_columns(["observation", "pose_x_m"]), "observation, pose_x_m"),
         (transitions.set_column(place("observation"), "observation", texts), "observation"),
         (transitions.set_column(place("reward"), "reward", texts), "reward"),
-        (recording_transitions(1), "cannot be split"),  # by recording, of which there is one
+        (recording_transitions(1), "cannot be split"),  # there is only one recording
     ):
         with pytest.raises(RestockError, match=named):
             build_panel(table, uniform(by="recording"), tmp_path / "panel", task=TASK)
         assert not list(tmp_path.iterdir())
 
 
-def test_a_table_may_have_other_types_of_the_same_kind(transitions, tmp_path):
+def test_compatible_column_types_are_accepted(transitions, tmp_path):
     table = transitions
     for name, kind in {
         "reward": pa.float64(),

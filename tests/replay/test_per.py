@@ -1,4 +1,4 @@
-"""Draws are in proportion to priorities, and weights undo exactly that."""
+"""Prioritised draws are proportional to priorities, and importance weights undo exactly that."""
 
 import numpy as np
 import pytest
@@ -47,23 +47,23 @@ def priorities(count: int, **numbers: float) -> Per:
     return Per(rows)
 
 
-def now(drawing: QuotaSampler) -> list[np.ndarray]:
+def current_priorities(drawing: QuotaSampler) -> list[np.ndarray]:
     """Return the priorities of each stratum as the next block will see them."""
-    drawing.state_dict()  # passes on what was learnt since the last block
+    drawing.state_dict()  # applies the updates since the last block
     return [draws.priority.astype(float) for draws in drawing.draws if isinstance(draws, Per)]
 
 
 @pytest.mark.parametrize("beta", [0.4, 0.8, 1.0])
-def test_weights_are_those_of_the_distribution_drawn_from(beta):
+def test_weights_match_drawn_distribution(beta):
     drawing = sampler(block=4, per_alpha=0.6, per_beta=beta)
     td = errors()
     for rows in STRATA:
         drawing.update(rows, td[rows])
-    seen = 0
+    drawn_rows = 0
     for batch in range(8):
         # Priorities change after every batch; those of batches 0 to 3 were drawn from the first.
         if batch % 4 == 0:
-            before = now(drawing)
+            before = current_priorities(drawing)
         drawn, stratum = drawing.draw()
         weights = drawing.drawn_weights
         assert weights is not None
@@ -75,9 +75,9 @@ def test_weights_are_those_of_the_distribution_drawn_from(beta):
             np.testing.assert_allclose(
                 weights[stratum == s], (len(rows) * p) ** -beta / mean, rtol=1e-4
             )
-            seen += len(p)
+            drawn_rows += len(p)
         drawing.update(drawn, np.random.default_rng(batch).uniform(0, 5, len(drawn)))
-    assert seen == 400
+    assert drawn_rows == 400
 
 
 def test_beta_grows_to_one():
@@ -86,7 +86,7 @@ def test_beta_grows_to_one():
     assert grown == pytest.approx([0.4, 0.7, 1.0, 1.0])
 
 
-def test_rows_not_drawn_yet_have_the_largest_priority():
+def test_undrawn_rows_have_largest_priority():
     draws = priorities(4, per_alpha=1.0)
     draws.update(np.array([0, 1]), np.array([7.0, 0.1], np.float32))
     draws.draw(1, np.random.default_rng(0), 0)
@@ -95,7 +95,7 @@ def test_rows_not_drawn_yet_have_the_largest_priority():
 
 @settings(max_examples=60)
 @given(size=st.integers(1, 70), count=st.integers(1, 40), seed=st.integers(0, 2**32))
-def test_places_are_of_the_stratum_whatever_the_priorities(size, count, seed):
+def test_drawn_places_are_valid_for_any_priorities(size, count, seed):
     rng, draws = np.random.default_rng(seed), priorities(size, per_alpha=1.0)
     for _ in range(12):
         places, weights = draws.draw(count, rng, 0)
@@ -108,19 +108,19 @@ def test_places_are_of_the_stratum_whatever_the_priorities(size, count, seed):
 
 @settings(max_examples=80)
 @given(st.integers(0, 2**32), st.integers(1, 200), st.integers(0, 300), st.booleans())
-def test_compiled_places_are_those_of_numpy(seed, chunks, draws, some_empty):
+def test_compiled_places_match_numpy(seed, chunks, draws, some_empty):
     if not native.IS_USED:
         pytest.skip(f"native code is {native.state()}")
     rng = np.random.default_rng(seed)
     priority = (10 ** rng.uniform(-4, 2, (chunks, CHUNK))).astype(np.float32)
-    if some_empty:  # as a stratum's last chunk is
+    if some_empty:  # as in a stratum's last chunk
         priority[rng.random(priority.shape) < 0.5] = 0
         priority[-1, 0] = 1
     sums = np.einsum("ij->i", priority)
     ends = np.cumsum(sums, dtype=np.float64)
     at = np.sort(rng.random(draws)) * ends[-1]
     if draws > 2:
-        at[0], at[-1] = 0.0, ends[-1]  # the range's own ends
+        at[0], at[-1] = 0.0, ends[-1]  # the ends of the range
         at[1] = ends[chunks // 2]
         at.sort()
     places = [np.full(draws, -1, np.int64) for _ in range(2)]
@@ -129,27 +129,27 @@ def test_compiled_places_are_those_of_numpy(seed, chunks, draws, some_empty):
     np.testing.assert_array_equal(places[0], places[1])
 
 
-def test_draws_are_the_same_without_compiled_code(monkeypatch):
+def test_draws_match_without_compiled_code(monkeypatch):
     drawn = []
     for used in (native.IS_USED, False):
         monkeypatch.setattr(native, "IS_USED", used)
-        one = sampler(block=4)
-        one.update(np.arange(0, 400, 2), errors()[::2])
-        drawn.append([(one.draw()[0].copy(), one.drawn_weights) for _ in range(9)])
+        drawing = sampler(block=4)
+        drawing.update(np.arange(0, 400, 2), errors()[::2])
+        drawn.append([(drawing.draw()[0].copy(), drawing.drawn_weights) for _ in range(9)])
     np.testing.assert_equal(*drawn)
 
 
-def test_the_mean_weight_of_many_rows_is_that_of_some():
-    """Of strata with more rows than are raised to a power: 1, to within a percent."""
+def test_mean_weight_of_large_stratum_is_one():
+    """Large strata estimate the mean weight from some of their rows: within a percent of 1."""
     rows = np.arange(200_000)
     rng = np.random.default_rng(0)
-    one = QuotaSampler([rows], [1.0], 256, rng, within="per", block=64)
-    one.update(rows, 10 ** np.random.default_rng(1).uniform(-2, 1, len(rows)))
+    drawing = QuotaSampler([rows], [1.0], 256, rng, within="per", block=64)
+    drawing.update(rows, 10 ** np.random.default_rng(1).uniform(-2, 1, len(rows)))
     weights = []
     for _ in range(64):
-        one.draw()
-        assert one.drawn_weights is not None
-        weights.append(float(one.drawn_weights.mean()))
+        drawing.draw()
+        assert drawing.drawn_weights is not None
+        weights.append(float(drawing.drawn_weights.mean()))
     assert np.mean(weights) == pytest.approx(1.0, abs=0.01)
 
 
@@ -157,11 +157,11 @@ def test_the_mean_weight_of_many_rows_is_that_of_some():
     ("td_abs", "message"),
     [
         (np.array([1.0, np.nan]), "not finite"),
-        (np.array([1.0, -0.5]), r"1 TD errors are negative, the least -0\.5"),  # not drawn again
+        (np.array([1.0, -0.5]), r"1 TD errors are negative, the least -0\.5"),  # never drawn again
         (np.ones(1), r"for rows of shape \(2,\)"),
         (np.ones((2, 1)), r"for rows of shape \(2,\)"),
     ],
 )
-def test_what_cannot_be_a_priority_is_refused(td_abs, message):
+def test_invalid_td_errors_are_refused(td_abs, message):
     with pytest.raises(MixtureError, match=message):
         sampler().update(np.array([0, 2]), td_abs)

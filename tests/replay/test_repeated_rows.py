@@ -1,4 +1,4 @@
-"""The same drive in two recordings is found by content, never trained on and held out at once."""
+"""A drive in two recordings is found by content, and never both trained on and held out."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ NEATO = SHARED / "fleet-neato"
 def audited(store: Path, shell: Shell) -> dict[str, list[dict[str, object]]]:
     """Return the first rows of each audit that failed."""
     findings = shell.json("audit", store, code=1)["audits"]
-    return {one["audit"]: one["sample"] for one in findings if one["status"] == "fail"}
+    return {found["audit"]: found["sample"] for found in findings if found["status"] == "fail"}
 
 
 def copy_of(
@@ -48,7 +48,7 @@ def copy_of(
 
 @pytest.mark.long
 @pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
-def test_a_drive_that_was_replayed_a_year_later(tmp_path, shell):
+def test_drive_replayed_a_year_later_is_found(tmp_path, shell):
     profile, store = str(tmp_path / "neato.toml"), str(tmp_path / "store")
     (original,) = (NEATO / "2022-original").iterdir()
     assert main(["profile", "new", str(original), "--out", profile]) == 0
@@ -62,26 +62,26 @@ def test_a_drive_that_was_replayed_a_year_later(tmp_path, shell):
 
 
 @pytest.mark.parametrize("later_s", [0, 33_194_320, -3600])
-def test_a_constant_shift_and_a_jitter_of_the_clocks(tmp_path, later_s):
-    one = recording_transitions(1)
-    copy = copy_of(one, 5, later_ns=later_s * 10**9, jitter_ns=90_000_000, first=100)
-    with Store(write_store(tmp_path / "store", [one, copy])) as store:
+def test_copy_with_shifted_and_jittered_clock_is_found(tmp_path, later_s):
+    drive = recording_transitions(1)
+    copy = copy_of(drive, 5, later_ns=later_s * 10**9, jitter_ns=90_000_000, first=100)
+    with Store(write_store(tmp_path / "store", [drive, copy])) as store:
         rows = store.sql("FROM repeated_rows(3)").fetchall()
-    assert len(rows) == len(one) - 100
+    assert len(rows) == len(drive) - 100
 
 
-def test_steps_at_other_times_of_the_drive_do_not_count(tmp_path):
-    """Steps 1 s apart from where the rest of the copy puts them are a chance, not a copy."""
-    one = recording_transitions(1)
-    copy = copy_of(one, 5)
+def test_steps_at_other_clock_shifts_do_not_count(tmp_path):
+    """Equal steps that are 1 s off the shift of the rest of the copy are a coincidence."""
+    drive = recording_transitions(1)
+    copy = copy_of(drive, 5)
     stamps = copy["stamp_ns"].to_numpy().copy()
     stamps[:40] += 10**9
     copy = replaced(copy, {"stamp_ns": stamps})
-    with Store(write_store(tmp_path / "store", [one, copy])) as store:
-        assert len(store.sql("FROM repeated_rows(3)").fetchall()) == len(one) - 40
+    with Store(write_store(tmp_path / "store", [drive, copy])) as store:
+        assert len(store.sql("FROM repeated_rows(3)").fetchall()) == len(drive) - 40
 
 
-def test_robots_that_stand_still_alike_are_two(tmp_path):
+def test_robots_standing_still_are_not_copies(tmp_path):
     def standing(recording: int) -> pa.Table:
         table, names = recording_transitions(recording), ("action", "pose_x_m", "pose_y_m")
         first = recording_transitions(1).select(["observation", *names]).to_pylist()[0]
@@ -91,10 +91,10 @@ def test_robots_that_stand_still_alike_are_two(tmp_path):
         assert store.sql("FROM repeated_rows(1)").fetchall() == []
 
 
-def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path):
-    one, other = recording_transitions(1), recording_transitions(2)
-    copy = copy_of(one, 5, later_ns=10**15, jitter_ns=2000)
-    store = write_store(tmp_path / "store", [one, other, copy])
+def test_copies_of_evaluation_steps_are_left_out(tmp_path):
+    drive, other = recording_transitions(1), recording_transitions(2)
+    copy = copy_of(drive, 5, later_ns=10**15, jitter_ns=2000)
+    store = write_store(tmp_path / "store", [drive, other, copy])
     panel = panel_of(store, EVERY + "[evaluation_split]\nshare = 0.2", tmp_path / "panel")
     kept = panel.meta
     held = pq.read_table(panel.path / "evaluation_split.parquet")
@@ -103,35 +103,35 @@ def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path):
         for table in (held, kept)
     )
     twins = {1: 5, 5: 1}
-    shown = {(twins[one], step) for one, step in held_steps if one in twins} - held_steps
+    shown = {(twins[number], step) for number, step in held_steps if number in twins} - held_steps
     assert shown
     assert not shown & trained
     assert panel.header.left_out["same steps as the evaluation split"] == len(shown)
 
 
-def test_a_panel_of_one_drive_twice_is_refused():
-    one = recording_transitions(1)
-    both = pa.concat_tables([one, copy_of(one, 5)])
+def test_split_of_one_drive_stored_twice_is_refused():
+    drive = recording_transitions(1)
+    both = pa.concat_tables([drive, copy_of(drive, 5)])
     with pytest.raises(MixtureError, match="the same drive is in the store more than once"):
         planned(both, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4")
 
 
-def test_without_an_evaluation_split_copies_stay():
-    one = recording_transitions(1)
-    plan = planned(pa.concat_tables([one, copy_of(one, 5)]), EVERY + NO_SPLIT)
-    assert len(plan.panel_rows) == 2 * len(one)
+def test_copies_stay_without_evaluation_split():
+    drive = recording_transitions(1)
+    plan = planned(pa.concat_tables([drive, copy_of(drive, 5)]), EVERY + NO_SPLIT)
+    assert len(plan.panel_rows) == 2 * len(drive)
 
 
-def test_episodes_learnt_under_another_id_are_not_held_out(tmp_path):
-    one, other = recording_transitions(1), recording_transitions(2)
-    learnt = panel_of(write_store(tmp_path / "learnt", [one]), EVERY + NO_SPLIT, tmp_path / "p")
-    logs = write_store(tmp_path / "logs", [one, other, copy_of(one, 5, later_ns=10**12)])
+def test_episodes_trained_under_other_id_are_not_held_out(tmp_path):
+    drive, other = recording_transitions(1), recording_transitions(2)
+    learnt = panel_of(write_store(tmp_path / "learnt", [drive]), EVERY + NO_SPLIT, tmp_path / "p")
+    logs = write_store(tmp_path / "logs", [drive, other, copy_of(drive, 5, later_ns=10**12)])
     dataset = load_ope_dataset(learnt, TASK, str(logs))
     assert len(dataset.evaluation.rows) == len(other)
-    assert f"{2 * len(one['episode_id'].unique())} episodes left out" in dataset.notes[0]
+    assert f"{2 * len(drive['episode_id'].unique())} episodes left out" in dataset.notes[0]
 
 
-def test_rows_of_ingests_that_were_replaced_are_not_looked_at():
+def test_replaced_ingests_are_ignored():
     rows = pa.list_(pa.struct({"transition_id": pa.int64(), "content": pa.int64()}))
     lists = [
         [{"transition_id": 10 * place + n, "content": n} for n in (1, 2)] for place in (1, 2, 3)

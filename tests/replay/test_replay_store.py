@@ -1,4 +1,4 @@
-"""The store's views: what they count, what they hide, and that every column is documented."""
+"""The store's views: their counts, the rows they hide, and the documentation of every column."""
 
 import gc
 import json
@@ -35,7 +35,7 @@ def rows(store: Store, query: str) -> list[dict[str, object]]:
     return found
 
 
-def test_transitions_are_those_that_were_written(store, transitions):
+def test_transitions_view_returns_written_rows(store, transitions):
     read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     expected = transitions.sort_by("transition_id")
     expected = expected.rename_columns({"condition": "primary_condition"})
@@ -50,9 +50,9 @@ def test_transitions_are_those_that_were_written(store, transitions):
 
 
 @pytest.mark.parametrize("attached", [False, True])
-def test_no_join_holds_the_transitions_in_memory(store, attached):
+def test_joins_do_not_hold_transitions_in_memory(store, attached):
     def held(node: dict[str, Any]) -> list[str]:
-        """Return what the joins of a plan keep: their right sides."""
+        """Return the right sides of a plan's hash joins, which are held in memory."""
         of_join = [str(node["children"][1])] if node["name"] == "HASH_JOIN" else []
         return of_join + [text for child in node["children"] for text in held(child)]
 
@@ -70,7 +70,7 @@ def test_no_join_holds_the_transitions_in_memory(store, attached):
         assert not any("transitions" in text or "reward" in text for text in joins), query
 
 
-def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path):
+def test_ingest_without_transitions_is_hidden(tmp_path):
     path = write_store(tmp_path / "Läger 7 (neu)" / "my store", [recording_transitions(1)])
     write_deltalake(str(path / "recordings"), manifest(recording_transitions(2)), mode="append")
     with Store(path) as store:
@@ -83,16 +83,16 @@ def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path):
     ("found", "command"),
     [(None, "sql"), ("restock-store/1", "audit"), ("restock-store/99", "store compact")],
 )
-def test_a_store_of_another_format_is_refused(tmp_path, monkeypatch, shell, found, command):
+def test_store_of_other_format_is_refused(tmp_path, monkeypatch, shell, found, command):
     monkeypatch.setattr("support.stores.FORMAT", found)
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     query = ["FROM recordings"] if command == "sql" else []
-    said = shell.err(*command.split(), path, *query)
-    assert str(path) in said
-    assert "restock ingest RECORDINGS --store NEW" in said
+    err = shell.err(*command.split(), path, *query)
+    assert str(path) in err
+    assert "restock ingest RECORDINGS --store NEW" in err
 
 
-def test_columns_that_older_rows_lack_are_null(tmp_path):
+def test_new_columns_are_null_in_older_rows(tmp_path):
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     newer = recording_transitions(2)
     newer = newer.append_column("payload_kg", pa.array(np.full(len(newer), 3.0)))
@@ -105,7 +105,7 @@ def test_columns_that_older_rows_lack_are_null(tmp_path):
     assert found == [(f"{1:016x}", None), (f"{2:016x}", 3.0)]
 
 
-def test_episodes_are_those_of_a_naive_reading(store, transitions):
+def test_episodes_match_naive_computation(store, transitions):
     by_episode: dict[str, list[dict[str, object]]] = {}
     for row in transitions.to_pylist():
         by_episode.setdefault(row["episode_id"], []).append(row)
@@ -126,7 +126,7 @@ def test_episodes_are_those_of_a_naive_reading(store, transitions):
         assert episode["handovers"] == 0
 
 
-def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path):
+def test_handovers_and_missing_steps_are_counted(tmp_path):
     table = recording_transitions(1, episodes=1)
     policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
     table = replaced(table, {"behaviour_policy": policy.tolist()})
@@ -138,7 +138,7 @@ def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path):
     assert episode["first_policy"] == "planner"
 
 
-def test_without_a_goal_there_is_no_success(tmp_path):
+def test_success_is_null_without_goal(tmp_path):
     task = Task(body=TASK.body, actions=TASK.actions, sectors=4, goal="none")
     path = write_store(tmp_path / "s", [recording_transitions(1, task=task)], task=task)
     with Store(path) as store:
@@ -146,13 +146,13 @@ def test_without_a_goal_there_is_no_success(tmp_path):
         assert store.sql("SELECT DISTINCT success_share FROM coverage").fetchall() == [(None,)]
 
 
-def test_coverage_counts_every_row_once_by_priority(store, transitions):
+def test_coverage_counts_each_row_once(store, transitions):
     found = rows(store, "FROM coverage")
     assert sum(row["primary_rows"] for row in found) == len(transitions)  # type: ignore[misc]
     assert sum(row["primary_share"] for row in found) == pytest.approx(1)  # type: ignore[misc]
 
 
-def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path):
+def test_unseen_condition_has_line_and_empty_cells(tmp_path):
     table = recording_transitions(1)
     keep = [
         "wheel_slip" not in held and not ("recovery" in held and action == 2)
@@ -171,7 +171,7 @@ def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path):
         ]
 
 
-def test_a_row_counts_for_every_condition_that_holds_in_it(store, transitions):
+def test_row_counts_for_each_of_its_conditions(store, transitions):
     held = [conditions or ["nominal"] for conditions in transitions["conditions"].to_pylist()]
     lines = rows(store, "FROM coverage_by_condition")
     assert {line["condition"]: line["rows_held"] for line in lines} == {
@@ -197,7 +197,7 @@ def test_a_row_counts_for_every_condition_that_holds_in_it(store, transitions):
             assert sum(row.get("rows_held", 1) for row in found) == len(mine), question
 
 
-def test_a_filter_by_condition_is_not_answered_in_part(store):
+def test_filter_by_condition_is_refused(store):
     for text in (
         "SELECT median(reward) FROM transitions WHERE condition = 'wheel_slip'",
         "SELECT t.condition, count(*) FROM transitions AS t GROUP BY ALL",
@@ -211,7 +211,7 @@ def test_a_filter_by_condition_is_not_answered_in_part(store):
         assert "`primary_condition`" in str(refused.value)
 
 
-def test_actions_have_names_unless_two_tasks_differ(store, tmp_path):
+def test_actions_are_named_unless_tasks_differ(store, tmp_path):
     for view in ("coverage", "cells_below(10000)"):
         named = store.sql(f"SELECT DISTINCT action, action_name FROM {view} ORDER BY 1").fetchall()
         assert dict(named).items() <= dict(enumerate(TASK.action_names)).items()
@@ -224,7 +224,7 @@ def test_actions_have_names_unless_two_tasks_differ(store, tmp_path):
         assert of_two.sql(question).fetchall() == [(None,)]
 
 
-def test_overlap_counts_pairs_both_ways(store, transitions):
+def test_label_overlap_counts_both_directions(store, transitions):
     held = [set(conditions) for conditions in transitions["conditions"].to_pylist()]
     for row in rows(store, "FROM label_overlap"):
         both = sum({row["condition"], row["other"]} <= names for names in held)
@@ -246,14 +246,14 @@ def test_near_duplicates_are_found(tmp_path):
     assert found[0]["transition_id"] == (1 << 25) + 4
 
 
-def test_ages_are_against_the_moment_asked_for(store, transitions):
+def test_ages_at_given_time(store, transitions):
     newest = max(transitions["stamp_ns"].to_pylist())
     day = "make_timestamp_ns(" + str(newest + 3 * 86400 * 10**9) + ")"
     ages = rows(store, f"FROM ages_at({day})")
     assert min(row["age_min_days"] for row in ages) == pytest.approx(3, abs=1e-3)  # type: ignore[type-var]
 
 
-def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path):
+def test_ages_use_log_time_for_simulated_stamps(tmp_path):
     simulated = np.arange(len(recording_transitions(1))) * 200_000_000
     table = replaced(recording_transitions(1), {"stamp_ns": simulated})
     row = replaced(manifest(table), {"clock_offset_ns": [1_700_000_000 * 10**9]})
@@ -264,7 +264,7 @@ def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path):
     assert oldest == "2023-11-14 22:13:20"
 
 
-def test_every_column_of_every_view_is_documented(store):
+def test_every_view_column_is_documented(store):
     undocumented = rows(store, "FROM columns WHERE meaning IS NULL OR meaning = ''")
     assert undocumented == []
     views = {
@@ -275,7 +275,9 @@ def test_every_column_of_every_view_is_documented(store):
     } - {f"stored_{name}" for name in ("transitions", "recordings", "ingests", "frames")}
     assert views == set(view_docs())
     there = {(row["view"], row["column_name"]) for row in rows(store, "FROM columns")}
-    assert {key for key in column_docs() if key[0] != "shared"} <= there  # no doc of nothing
+    assert {
+        key for key in column_docs() if key[0] != "shared"
+    } <= there  # every documented column exists
 
 
 def test_queries_are_read_only(store, tmp_path):
@@ -304,7 +306,7 @@ def test_queries_are_read_only(store, tmp_path):
         assert store.sql(text).columns
 
 
-def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path, shell):
+def test_last_statement_must_give_rows(store_path, shell):
     for text in (
         "CREATE TABLE mine AS SELECT 1",
         "SET threads = 1",
@@ -316,7 +318,7 @@ def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path, shell):
     assert main(["sql", str(store_path), "CREATE MACRO more(x) AS x + 1; SELECT more(1) AS n"]) == 0
 
 
-def test_an_episode_of_two_equal_conditions_is_of_the_first(tmp_path):
+def test_episode_kind_of_two_equal_conditions(tmp_path):
     steps = recording_transitions(1)
     both = pa.array([["wheel_slip", "near_collision"]] * len(steps), pa.list_(pa.string()))
     steps = replaced(steps, {"conditions": both})
@@ -326,7 +328,7 @@ def test_an_episode_of_two_equal_conditions_is_of_the_first(tmp_path):
 
 
 @pytest.mark.parametrize("before", ["", "SELECT 1; "])
-def test_tables_between_commas_are_not_crossed(store_path, before):
+def test_comma_joins_are_not_cross_products(store_path, before):
     text = f"""
         {before}SELECT count(*) FROM transitions AS t, recordings AS r, episodes AS e
         WHERE t.episode_id = e.episode_id AND e.recording_id = r.recording_id
@@ -339,7 +341,7 @@ def test_tables_between_commas_are_not_crossed(store_path, before):
         assert store.sql(text).fetchall() == every
 
 
-def test_a_pivot_takes_its_columns_from_the_data(store):
+def test_pivot_takes_columns_from_data(store):
     found = store.sql(
         "PIVOT (SELECT zone, primary_condition FROM transitions) ON primary_condition"
     )
@@ -354,7 +356,7 @@ def test_a_pivot_takes_its_columns_from_the_data(store):
     )
 
 
-def test_what_is_no_store_is_refused_by_what_it_is(tmp_path):
+def test_places_other_than_stores_are_refused(tmp_path):
     write_store(tmp_path / "s", [recording_transitions(1)])
     assert is_store(tmp_path / "s")
     for folder, file in (("empty", None), ("panel", "panel.json"), ("run", "config.json")):
@@ -376,32 +378,32 @@ def test_what_is_no_store_is_refused_by_what_it_is(tmp_path):
 
 
 @pytest.mark.parametrize("limit", ["lots", "5", "0 kib", "0%", "-1", "none"])
-def test_a_memory_limit_that_is_none_is_refused(store_path, limit):
+def test_invalid_memory_limit_is_refused(store_path, limit):
     with pytest.raises(StoreError, match="4GB"):
         Store(store_path, memory_limit=limit)
 
 
 @pytest.mark.parametrize(("limit", "kept"), [("300MB", "286"), ("0.5 GB", "476"), ("2 GiB", "2.0")])
-def test_a_memory_limit_is_kept(store_path, limit, kept):
+def test_memory_limit_is_applied(store_path, limit, kept):
     with Store(store_path, memory_limit=limit) as store:
         ((held,),) = store.sql("SELECT current_setting('memory_limit')").fetchall()
     assert held.startswith(kept)  # MiB, GiB
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_a_store_is_freed_with_its_threads(tmp_path, closed):
+def test_store_is_freed(tmp_path, closed):
     StoreWriter(tmp_path / "s").write(*one(1))
     store = Store(tmp_path / "s")
     store.sql("SHOW TABLES").fetchall()  # makes every view, macro and function
     if closed:
         store.close()
-    left = [weakref.ref(store), weakref.ref(store.bare)]
+    references = [weakref.ref(store), weakref.ref(store.bare)]
     del store
     gc.collect()
-    assert [one_left() for one_left in left] == [None, None]
+    assert [reference() for reference in references] == [None, None]
 
 
-def test_a_store_that_another_thread_reads_from_says_so(store_path):
+def test_store_in_use_by_other_thread_is_refused(store_path):
     opened, reading, go_on = Store(store_path), threading.Event(), threading.Event()
 
     def wait(value: int) -> int:

@@ -1,4 +1,4 @@
-"""An archive of incidents stands for natural rates: those of the main store, or given ones."""
+"""An archive of incidents represents natural rates: those of the main store, or given ones."""
 
 import json
 from pathlib import Path
@@ -49,7 +49,7 @@ below_natural = "allow"
 
 
 def recording(number: int, episodes: int, near: int) -> pa.Table:
-    """Of whose episodes the first `near` come too near to something, and the rest to nothing."""
+    """Return a recording with a near collision in each of the first `near` episodes."""
     rows = recording_transitions(number, episodes=episodes)
     episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
     held = (episode < near) & (step == 3)
@@ -65,7 +65,7 @@ def recording(number: int, episodes: int, near: int) -> pa.Table:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Return a store in which one mission of fifty is a near collision, and an archive of those."""
+    """Return a folder with a store, 2 % of its episodes near collisions, and an archive."""
     folder = tmp_path_factory.mktemp("fleet")
     write_store(folder / "main", [recording(1, 100, 2)])
     write_store(folder / "incidents", [recording(2, 30, 25)])
@@ -96,19 +96,21 @@ def natural(plan: PanelPlan) -> dict[str, float]:
     return {line.name: line.natural_share for line in plan.strata}
 
 
-def test_an_archive_that_does_not_say_so_is_refused_by_name(folder):
-    with pytest.raises(MixtureError, match="'incidents' looks like an archive: 25 of its 30") as no:
+def test_undeclared_archive_is_refused(folder):
+    with pytest.raises(
+        MixtureError, match="'incidents' looks like an archive: 25 of its 30"
+    ) as error:
         planned(folder)
-    assert "2 of 100" in no.value.what
-    assert 'represents = "archive"' in str(no.value.remedy)
-    assert "near_collision = 0.02" in str(no.value.remedy)
+    assert "2 of 100" in error.value.what
+    assert 'represents = "archive"' in str(error.value.remedy)
+    assert "near_collision = 0.02" in str(error.value.remedy)
 
 
-def test_the_main_store_may_be_the_archive(folder):
-    with pytest.raises(MixtureError, match="'logs' looks like an archive") as no:
+def test_main_store_can_be_archive(folder):
+    with pytest.raises(MixtureError, match="'logs' looks like an archive") as error:
         planned(folder, first="incidents")
-    assert "[sources]" in str(no.value.remedy)
-    assert '"archive"' not in str(no.value.remedy)  # of itself
+    assert "[sources]" in str(error.value.remedy)
+    assert '"archive"' not in str(error.value.remedy)  # the main store cannot represent itself
     plan = planned(folder, main="represents = { near_collision = 0.03 }", first="incidents")
     assert natural(plan)["near_collision"] == pytest.approx(0.03)
     assert natural(plan)["nominal"] == pytest.approx(0.97)
@@ -122,24 +124,24 @@ def test_the_main_store_may_be_the_archive(folder):
         ((3, 6), (21, 182), False, False),  # a small one, by chance
         ((30, 100), (50, 182), False, False),
         ((180, 1000), (100, 1000), False, False),  # surely more, and less than twice
-        ((0, 0), (21, 182), False, False),  # no episode tells
+        ((0, 0), (21, 182), False, False),  # without episodes
     ],
 )
-def test_archives_are_told_by_their_odds(mine, theirs, refused, warned):
-    said = {"logs": None, "incidents": None}
+def test_archives_are_detected_by_odds(mine, theirs, refused, warned):
+    declared = {"logs": None, "incidents": None}
     observed = {"near_collision": [theirs, mine]}
     if refused:
         with pytest.raises(MixtureError, match="looks like an archive"):
-            look_for_archives(said, observed, ["near_collision"])
-    # What is no stratum has no rate to be given; the rows are a selection all the same.
-    warnings = look_for_archives(said, observed, ["all"] if refused else ["near_collision"])
+            look_for_archives(declared, observed, ["near_collision"])
+    # A condition without a stratum cannot be given a rate, so it only warns.
+    warnings = look_for_archives(declared, observed, ["all"] if refused else ["near_collision"])
     assert bool(warnings) == warned
     assert all("'incidents' may be an archive" in text for text in warnings)
-    assert look_for_archives(said | {"incidents": "archive"}, observed, ["all"]) == ()
+    assert look_for_archives(declared | {"incidents": "archive"}, observed, ["all"]) == ()
 
 
-def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, shell):
-    """By its conditions or its exposures, whatever the strata are."""
+def test_possible_archive_warns(tmp_path, shell):
+    """Both conditions and exposures are compared, whatever the strata are."""
     write_store(tmp_path / "main", [recording(1, 100, 20)])
     write_store(tmp_path / "incidents", [recording(2, 30, 14)])
     plan = planned(tmp_path)
@@ -147,7 +149,7 @@ def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, shell):
     assert planned(tmp_path, 'represents = "natural"').warnings == ()
 
     exposed = recording(3, 30, 6)
-    there = exposed["episode_index"].to_numpy() < 26  # a third of those of the main store
+    there = exposed["episode_index"].to_numpy() < 26  # in the main store, a third of the episodes
     names = [["closing_traffic"] if one else [] for one in there]
     write_store(tmp_path / "bags", [replaced(exposed, {"exposures": names})])
     (tmp_path / "m.toml").write_text(
@@ -159,29 +161,27 @@ def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, shell):
     assert len(json.loads(out)["warnings"]) == 1
 
 
-def test_an_archive_stands_for_the_main_rates_or_given_ones(folder):
+def test_archive_represents_main_or_given_rates(folder):
     own = natural(planned(folder, 'represents = "natural"'))
     assert own["incidents/near_collision"] > 0.7 > 0.05 > own["near_collision"]
-    reported = natural(planned(folder, 'represents = "archive"'))
-    assert (
-        reported["incidents/near_collision"] == reported["near_collision"] == own["near_collision"]
-    )
+    archive = natural(planned(folder, 'represents = "archive"'))
+    assert archive["incidents/near_collision"] == archive["near_collision"] == own["near_collision"]
     given_ = natural(planned(folder, "represents = { near_collision = 0.004 }"))
     assert given_["incidents/near_collision"] == pytest.approx(0.004)
     assert given_["incidents/nominal"] == pytest.approx(0.996)
     assert given_["near_collision"] == own["near_collision"]
 
 
-def test_natural_shares_are_the_represented_ones(folder):
+def test_natural_shares_use_represented_rates(folder):
     plan = planned(folder, 'represents = "archive"', share='"natural"')
     lines = {line.name: line for line in plan.strata}
     assert lines["incidents/near_collision"].share == pytest.approx(
-        lines["near_collision"].share  # half of the logs' part is of each store
+        lines["near_collision"].share  # each store supplies half of the logged rows
     )
 
 
-def test_full_correction_weighs_an_archive_back_to_its_rates(folder, tmp_path):
-    """In the plan, and in a run whose weights follow the shares."""
+def test_full_correction_restores_represented_rates(folder, tmp_path):
+    """This holds in the plan, and in a run whose weights follow the shares."""
     archive = "represents = { near_collision = 0.02 }"
     plan = planned(folder, archive, rule="full")
     lines = {line.name: line for line in plan.strata}
@@ -190,18 +190,18 @@ def test_full_correction_weighs_an_archive_back_to_its_rates(folder, tmp_path):
     assert rare == pytest.approx(0.02, rel=1e-5)
     uncorrected = planned(folder, archive)
     boosted = next(s for s in uncorrected.strata if s.name == "incidents/near_collision")
-    assert boosted.effective_share == boosted.share  # weighed only where that is asked for
+    assert boosted.effective_share == boosted.share  # weighted only if requested
 
     mixture = plan.mixture
     with Store(folder / "main") as store, open_source(store, mixture, folder=folder) as source:
         panel = write_panel(source, plan, tmp_path / "panel")
-    assert weighed_share(panel, "incidents/near_collision", "incidents/nominal") == pytest.approx(
+    assert weighted_share(panel, "incidents/near_collision", "incidents/nominal") == pytest.approx(
         0.02, rel=1e-4
     )
 
 
-def weighed_share(panel: Panel, stratum: str, other: str) -> float:
-    """Of what a run draws of two strata, the first one's part of the weight."""
+def weighted_share(panel: Panel, stratum: str, other: str) -> float:
+    """Return the first stratum's part of the weight that a run draws from two strata."""
     sampler, batches = sampler_for(panel, 128, seed=0), 40
     names = [line.name for line in panel.strata]
     part = dict.fromkeys((stratum, other), 0.0)
@@ -231,8 +231,8 @@ pre = "full"
 
 
 @pytest.mark.parametrize("shares", [("", ""), ("share = 0.6", "share = 0.4")])
-def test_a_cap_on_the_rows_of_an_episode_changes_no_natural_rate(transitions, tmp_path, shares):
-    """Neither what "natural" means, nor what a correction leads back to, in a plan and a run."""
+def test_row_cap_per_episode_keeps_natural_rates(transitions, tmp_path, shares):
+    """Natural shares and corrected rates stay the same, in the plan and in a run."""
     nominal, near = shares
     whole, capped = (
         panel_of(transitions, CAPPED.format(nominal=nominal, near=near, cap=cap), tmp_path / name)
@@ -244,7 +244,7 @@ def test_a_cap_on_the_rows_of_an_episode_changes_no_natural_rate(transitions, tm
         assert of_capped[name].natural_share == line.natural_share
         assert of_capped[name].share == pytest.approx(line.share)
         assert of_capped[name].effective_share == pytest.approx(line.natural_share, rel=1e-5)
-    run = weighed_share(capped, "near_collision", "nominal")
+    run = weighted_share(capped, "near_collision", "nominal")
     assert run == pytest.approx(of_whole["near_collision"].natural_share, rel=0.02)
 
 
@@ -255,7 +255,7 @@ def test_a_cap_on_the_rows_of_an_episode_changes_no_natural_rate(transitions, tm
 )
 @settings(max_examples=100)
 def test_weights_recover_natural_rates_exactly(rows, data, timing):
-    """Whatever was kept, and whatever shares it is drawn in: full correction gives the rates."""
+    """Full correction restores the rates for any numbers of rows and any shares."""
     size = len(rows)
     parts = st.lists(st.floats(0.01, 1.0), min_size=size, max_size=size)
     rates, shares = (np.array(data.draw(parts)) for _ in range(2))
@@ -269,15 +269,15 @@ def test_weights_recover_natural_rates_exactly(rows, data, timing):
     rule = CorrectionRule(pre="full", post="full")
     weights = importance_weights(code, state, strata, shares, rule, None, rates)
     assert effective_shares(code, weights, shares) == pytest.approx(rates, rel=1e-4)
-    # And so do the rows that an outcome's probability is fitted on.
-    worth = stands_for(code, size, rates)
-    assert worth.sum() == pytest.approx(len(code))
-    assert np.bincount(code, worth) / len(code) == pytest.approx(rates)
+    # Rows that outcome probabilities are fitted on represent the same rates.
+    represented = stands_for(code, size, rates)
+    assert represented.sum() == pytest.approx(len(code))
+    assert np.bincount(code, represented) / len(code) == pytest.approx(rates)
 
 
 @given(st.lists(st.integers(1, 50), min_size=2, max_size=4), st.data())
 @settings(max_examples=30)
-def test_a_natural_sample_stands_for_itself(rows, data):
+def test_natural_sample_represents_itself(rows, data):
     size = len(rows)
     shares = np.array(data.draw(st.lists(st.floats(0.1, 1), min_size=size, max_size=size)))
     strata = [
@@ -306,6 +306,6 @@ def test_a_natural_sample_stands_for_itself(rows, data):
         ("", "represents = {}", "an empty table"),
     ],
 )
-def test_rates_that_cannot_be_meant_are_refused(folder, archive, main, named):
+def test_invalid_rates_are_refused(folder, archive, main, named):
     with pytest.raises((MixtureError, ConfigError), match=named):
         planned(folder, archive, main, rule="full")

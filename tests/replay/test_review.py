@@ -1,4 +1,4 @@
-"""Label review: doubtful events are listed with their moment, and verdicts are taken back."""
+"""Label review: doubtful events are listed in a CSV file, and verdicts are read back."""
 
 import csv
 import io
@@ -35,7 +35,7 @@ def monday(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def reviewed(tmp_path_factory) -> tuple[Path, list[DoubtfulEvent]]:
-    """Return two recordings with probabilities of `recovery`, and what is doubtful."""
+    """Return a store of two recordings with probabilities of `recovery`, and doubtful events."""
     path = tmp_path_factory.mktemp("small") / "store"
     for recording in (1, 2):
         StoreWriter(path).write(*one(recording))
@@ -43,8 +43,8 @@ def reviewed(tmp_path_factory) -> tuple[Path, list[DoubtfulEvent]]:
         return path, doubtful_events(store, 1000)
 
 
-def truly(store: Store) -> dict[str, dict[int, frozenset[str]]]:
-    """episode -> step -> its true conditions."""
+def true_conditions(store: Store) -> dict[str, dict[int, frozenset[str]]]:
+    """Return the true conditions by episode and step."""
     found: dict[str, dict[int, frozenset[str]]] = {}
     query = "SELECT episode_id, step_index, true_condition FROM transitions"
     for episode, step, text in store.sql(query).fetchall():
@@ -61,7 +61,7 @@ def true_steps(
 
 
 def is_wrong(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]]]) -> bool:
-    """Return whether a label is wrong: no true step within .4 s, or an unlabelled one with any."""
+    """Return whether a label lacks a true step within 0.4 s, or a true step has no label."""
     return bool(true_steps(event, truth, 2 if event.labelled else 0)) != event.labelled
 
 
@@ -73,7 +73,7 @@ def true_verdict(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]
 @pytest.mark.long
 def test_doubtful_events_are_wrong_more_often(monday, tmp_path):
     with Store(monday) as store:
-        truth, events = truly(store), doubtful_events(store, 100_000)
+        truth, events = true_conditions(store), doubtful_events(store, 100_000)
     wrong = [is_wrong(event, truth) for event in events]
     assert sum(wrong[:30]) / 30 >= 1.2 * sum(wrong) / len(wrong)
 
@@ -93,19 +93,19 @@ def test_doubtful_events_are_wrong_more_often(monday, tmp_path):
         verdicts = read_verdicts(file, store)
     correct_store(StoreWriter(monday), verdicts.given)
     assert wrong_steps() < before
-    with Store(monday) as store:  # what somebody spoke of is not asked again
+    with Store(monday) as store:  # events with a verdict are not listed again
         left = {event.event for event in doubtful_events(store, 100_000)}
     assert not left & {event.event for event in events[:30]}
 
 
-def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, shell):
+def test_review_file_has_commands_that_open_events(monday, tmp_path, shell):
     file = tmp_path / "my review.csv"
-    shown, said = shell.printed("review", monday, "--out", file)
+    out, err = shell.printed("review", monday, "--out", file)
     then = ["review", str(monday), str(file)]
-    assert shlex.split(said.split("then run: restock ")[1]) == then
+    assert shlex.split(err.split("then run: restock ")[1]) == then
     with file.open(newline="") as text:
         rows = list(csv.DictReader(text))
-    assert f"{len(rows)} events" in shown
+    assert f"{len(rows)} events" in out
     assert {row["verdict"] for row in rows} == {""}
     command = shlex.split(rows[0]["open"])
     assert command[0] == "restock"
@@ -114,11 +114,11 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(monday, tmp_path, she
     assert traced["transition"]["episode_id"] == rows[0]["episode_id"]
     assert traced["transition"]["step_index"] == int(rows[0]["first_step"])
     assert traced["messages"]
-    # Verdicts may be in it: it is not written over.
+    # The file may contain verdicts, so it is not overwritten.
     assert "may contain verdicts" in shell.err("review", monday, "--out", file)
 
 
-def test_a_list_without_events_is_a_header_and_says_so(tmp_path, shell):
+def test_review_without_events(tmp_path, shell):
     rows = recording_transitions(1, episodes=2)
     nothing = {"condition": "nominal", "conditions": [], "probabilities": []}
     rows = replaced(rows, {name: [value] * len(rows) for name, value in nothing.items()})
@@ -129,10 +129,10 @@ def test_a_list_without_events_is_a_header_and_says_so(tmp_path, shell):
             assert json.loads(shown)["events"] == 0
         else:
             assert "no uncertain event is left to review" in " ".join(shown.split())
-        # As with verdicts that are all empty, there is nothing to take from it.
+        # A file without verdicts changes nothing.
         assert "no verdict is new" in shell.out("review", store, file)
         file.unlink()
-    # Nor is there a page to serve.
+    # There is no page to serve either.
     assert "no uncertain event is left to review" in shell.out("review", store)
 
 
@@ -148,7 +148,7 @@ def fill(
     return file
 
 
-def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, shell):
+def test_verdicts_change_labels_except_in_dry_run(reviewed, tmp_path, shell):
     small, events = tmp_path / "store", reviewed[1]
     shutil.copytree(reviewed[0], small)
     assert events == sorted(events, key=lambda event: event.margin)
@@ -160,9 +160,9 @@ def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, s
     first = events[long].first_step
     file = fill(small, events, tmp_path / "review.csv", {no: "No", long: f"{first}..{first}"})
     for dry in (["--dry-run"], []):
-        said = shell.json("review", small, file, *dry)
-        assert (said["verdicts"], said["without_verdict"]) == (2, len(events) - 2)
-        assert (said["version"] is None) == bool(dry)
+        document = shell.json("review", small, file, *dry)
+        assert (document["verdicts"], document["without_verdict"]) == (2, len(events) - 2)
+        assert (document["version"] is None) == bool(dry)
         with Store(small) as store:
             assert len(store.sql("FROM corrections").fetchall()) == (0 if dry else 3)
     with Store(small) as store:
@@ -192,7 +192,7 @@ def test_verdicts_change_the_labels_and_a_dry_run_does_not(reviewed, tmp_path, s
         ("yes", {"last_step": "9" * 5000}, "at `$.last_step`"),
     ],
 )
-def test_a_line_that_does_not_fit_is_named(reviewed, tmp_path, verdict, changed, problem):
+def test_invalid_review_line_is_reported(reviewed, tmp_path, verdict, changed, problem):
     small, events = reviewed
     file = fill(small, events, tmp_path / "review.csv", {0: verdict, 3: "yes"}, **changed)
     with Store(small) as store, pytest.raises(LabelError, match=re.escape(problem)) as error:
@@ -210,7 +210,7 @@ def test_a_line_that_does_not_fit_is_named(reviewed, tmp_path, verdict, changed,
         (HEADER + '"{episode},wheel_slip', "is not CSV"),
     ],
 )
-def test_a_file_that_cannot_be_taken_is_refused(reviewed, tmp_path, text, problem):
+def test_invalid_review_file_is_refused(reviewed, tmp_path, text, problem):
     file = tmp_path / "file.csv"
     text = text.format(episode=f"{1:016x}/0")
     file.write_bytes(text.encode("latin-1"))
@@ -218,7 +218,7 @@ def test_a_file_that_cannot_be_taken_is_refused(reviewed, tmp_path, text, proble
         read_verdicts(file, store)
 
 
-def test_the_later_of_two_verdicts_counts(reviewed, tmp_path):
+def test_later_verdict_counts(reviewed, tmp_path):
     small, file, place = tmp_path / "store", tmp_path / "file.csv", f"{1:016x}/0"
     shutil.copytree(reviewed[0], small)
     file.write_text(f"{HEADER}{place},wheel_slip,0,3,yes\n{place},wheel_slip,3,5,no\n")
@@ -249,7 +249,7 @@ def test_wrong_usage_writes_nothing(reviewed, shell):
     assert sorted(reviewed[0].rglob("*")) == before
 
 
-def test_a_spreadsheet_runs_no_name_as_a_formula(reviewed):
+def test_names_are_escaped_against_spreadsheet_formulas(reviewed):
     rows = review_rows(reviewed[1][:1], "store")
     hostile = "=cmd|' /C calc'!A0.mcap"
     line = next(csv.DictReader(io.StringIO(review_csv([rows[0] | {"source_file": hostile}]))))

@@ -1,4 +1,4 @@
-"""Whether more success earns more: told of planted drivers, and not told where it cannot be."""
+"""The audit of whether more success earns more, over synthetic drivers."""
 
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -30,9 +30,9 @@ Episode = tuple[str, list[float], str]  # driver, reward of each step, goal | bu
 STEP = -0.02
 
 
-def earlier(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
-    """Return a mission as it was paid before: -3 for each of two pressed steps."""
-    rewards = [way / steps + STEP] * steps
+def earlier_reward(route_m: float, steps: int, bumps: bool) -> tuple[list[float], str]:
+    """Return a mission's rewards under an earlier rule: -3 for each of two steps in contact."""
+    rewards = [route_m / steps + STEP] * steps
     if bumps:
         rewards[steps // 2] -= 3.0
         rewards[steps // 2 + 1] -= 3.0
@@ -40,9 +40,9 @@ def earlier(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
     return rewards, "goal after a bump" if bumps else "goal"
 
 
-def shipped(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
-    """Return a profile in which a bump ends the episode and costs 6."""
-    rewards, _ = earlier(way, steps, False)
+def shipped_reward(route_m: float, steps: int, bumps: bool) -> tuple[list[float], str]:
+    """Return a mission's rewards under the shipped rule: a bump ends the episode and costs 6."""
+    rewards, _ = earlier_reward(route_m, steps, False)
     if not bumps:
         return rewards, "goal"
     rewards = rewards[: steps // 2 + 1]
@@ -51,19 +51,22 @@ def shipped(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
 
 
 def hasty_and_careful(pay: Callable[..., tuple[list[float], str]], count: int) -> list[Episode]:
-    """Return a store with a careful planner, and a quicker agent that bumps in a quarter."""
+    """Return missions of a careful planner, and of a faster agent that bumps in a quarter."""
     rng = np.random.default_rng(0)
-    ways = rng.uniform(6, 10, count).tolist()
-    careful: list[Episode] = [("planner", *pay(way, round(way * 9), False)) for way in ways]
+    routes_m = rng.uniform(6, 10, count).tolist()
+    careful: list[Episode] = [
+        ("planner", *pay(route_m, round(route_m * 9), False)) for route_m in routes_m
+    ]
     hasty: list[Episode] = [
-        ("agent", *pay(way, round(way * 6), number % 4 == 0)) for number, way in enumerate(ways)
+        ("agent", *pay(route_m, round(route_m * 6), number % 4 == 0))
+        for number, route_m in enumerate(routes_m)
     ]
     return careful + hasty
 
 
 @cache
 def some_rows() -> pa.Table:
-    """More rows than any of these stores has; what is asked about is replaced."""
+    """Return more rows than any store here needs; the audited columns are replaced."""
     return recording_transitions(1, episodes=500)
 
 
@@ -91,7 +94,7 @@ def store_of(path: Path, episodes: Sequence[Episode]) -> Path:
 
 
 def audited(place: Path, **options: Any) -> dict[str, str]:
-    """Verdicts of a place by condition and pair, and what its audits came to."""
+    """Return audit statuses, and verdicts by condition and pair of drivers."""
     found = audit_reward(place, load_audits(), load_thresholds(), **options)
     status = {
         finding.audit.name.removeprefix("evaluated_"): finding.status for finding in found.findings
@@ -100,14 +103,14 @@ def audited(place: Path, **options: Any) -> dict[str, str]:
     return status | pairs
 
 
-def test_a_reward_that_does_not_pay_for_haste_passes(tmp_path):
-    found = audited(store_of(tmp_path / "store", hasty_and_careful(shipped, 120)))
+def test_reward_that_does_not_favour_haste_passes(tmp_path):
+    found = audited(store_of(tmp_path / "store", hasty_and_careful(shipped_reward, 120)))
     pair = {"nominal: planner 1 > agent 1": "agrees"}
     assert found == {"reward_order": "pass", "reward_undetermined": "pass"} | pair
 
 
-def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, shell):
-    place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 60)))
+def test_audit_verb_fails_with_numbers_and_remedy(tmp_path, shell):
+    place = str(store_of(tmp_path / "store", hasty_and_careful(earlier_reward, 60)))
     shown = " ".join(
         shell.out("audit", place, "--reward", "--discount", "0.97", code=1).split()
     )  # a cell may be wrapped
@@ -120,26 +123,26 @@ def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, shell):
     of_all = {r["driver"]: r for r in document["returns"] if r["outcome"] == "all"}
     assert of_all["agent 1"]["success_share"] == 0.75
     assert of_all["agent 1"]["discounted_mean"] > of_all["planner 1"]["discounted_mean"]
-    # What the drivers are told from is a view as well.
+    # The returns are a view as well.
     assert cli.main(["sql", place, "SELECT sum(episodes) FROM returns WHERE outcome = 'all'"]) == 0
-    with pytest.raises(ConfigError, match="'reward_order'"):  # what is near
+    with pytest.raises(ConfigError, match="'reward_order'"):  # the nearest name
         audit_reward(Path(place), load_audits(), {"reward_orders": {"min_share": 0.5}})
 
 
-def test_returns_are_discounted_from_the_first_step(tmp_path):
+def test_returns_are_discounted_from_first_step(tmp_path):
     rewards = [1.0, 2.0, 4.0]
     place = store_of(tmp_path / "store", [("planner", rewards, "goal"), ("agent", [9.0], "goal")])
     with Store(place) as store:
         rows = store.sql("SELECT discounted_return FROM discounted_episodes(0.5) ORDER BY ALL")
         assert [value for (value,) in rows.fetchall()] == [1.0 + 1.0 + 1.0, 9.0]
-    # So is what is listed beside the audits.
+    # The returns listed beside the audits are discounted, too.
     found = audit_reward(place, load_audits(), load_thresholds(), discount=0.5)
     assert {row["discounted_mean"] for row in found.returns} == {3.0, 9.0}
 
 
 @pytest.mark.parametrize("drivers", ["few", "one", "handed over"])
-def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, shell, drivers):
-    episodes = hasty_and_careful(earlier, 19 if drivers == "few" else 60)
+def test_undetermined_order_warns(tmp_path, shell, drivers):
+    episodes = hasty_and_careful(earlier_reward, 19 if drivers == "few" else 60)
     if drivers == "one":
         episodes = [("planner", rewards, outcome) for _, rewards, outcome in episodes]
     place = store_of(tmp_path / "store", episodes)
@@ -150,13 +153,13 @@ def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, shell, driver
     assert "undetermined" in shell.out("audit", place, "--reward", "--strict", code=1)
 
 
-def test_an_evaluation_is_compared_mission_by_mission(tmp_path):
-    """Missions differ far more than drivers do: only their pairs tell."""
+def test_evaluation_is_compared_mission_by_mission(tmp_path):
+    """Missions differ far more than drivers do, so only paired differences are conclusive."""
     run = make_run(tmp_path / "run", document())
     with pytest.raises(RunError, match="no evaluation with discounted returns"):
         audited(run)
     rng = np.random.default_rng(1)
-    worth = rng.normal(0, 20, 60)
+    mission_returns = rng.normal(0, 20, 60)
     rows: list[dict[str, Any]] = []
     for policy, success, bonus in (("operator", 1.0, -0.5), ("agent", 0.7, 0.0)):
         rows += [
@@ -168,18 +171,20 @@ def test_an_evaluation_is_compared_mission_by_mission(tmp_path):
                 "condition": "near_collision",
                 "block": "none",
                 "episode_seed": seed,
-                "success": bool(seed < success * len(worth)),
-                "discounted_return": float(worth[seed] + bonus + rng.normal(0, 0.1)),
+                "success": bool(seed < success * len(mission_returns)),
+                "discounted_return": float(mission_returns[seed] + bonus + rng.normal(0, 0.1)),
                 "return": 0.0,
-                "failure": None if seed < success * len(worth) else "bump",
+                "failure": None if seed < success * len(mission_returns) else "bump",
             }
-            for seed in range(len(worth))
+            for seed in range(len(mission_returns))
         ]
     add_evaluation(run, pa.Table.from_pylist(rows, EVAL_EPISODES))
     found = audited(run)
     assert found["reward_order"] == "fail"
     assert found["near_collision: operator 1 > agent 1"] == "reversed"
-    assert cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2  # it has its own
+    assert (
+        cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2
+    )  # the run has its own discount
 
 
 def ordered(
@@ -190,7 +195,7 @@ def ordered(
     paired: bool = False,
     min_episodes: int = 20,
 ) -> dict[str, Any]:
-    """`return_order` of two drivers, a and b, with these returns and shares of success."""
+    """Return the `return_order` of drivers a and b with these returns and success shares."""
     rows = [
         {
             "condition": "c",
@@ -217,7 +222,7 @@ def ordered(
 
 
 @pytest.mark.parametrize("paired", [True, False])
-def test_returns_of_fewer_than_three_episodes_have_no_interval(paired):
+def test_fewer_than_three_episodes_have_no_interval(paired):
     for few in (1, 2):
         many = few if paired else 40
         row = ordered([5.0] * few, list(range(many)), paired=paired, min_episodes=1)
@@ -226,7 +231,7 @@ def test_returns_of_fewer_than_three_episodes_have_no_interval(paired):
         assert ordered([5.0] * few, list(range(many)), paired=paired)["verdict"] == "undetermined"
 
 
-def test_the_command_shows_a_pair_without_an_interval(tmp_path, shell):
+def test_audit_verb_shows_pair_without_interval(tmp_path, shell):
     episodes: list[Episode] = [("planner", [1.0], "goal"), ("agent", [2.0], "goal")]
     place = str(store_of(tmp_path / "store", [*episodes, ("agent", [3.0], "bump")]))
     shown = shell.out("audit", place, "--reward")
@@ -238,7 +243,7 @@ def test_the_command_shows_a_pair_without_an_interval(tmp_path, shell):
 @pytest.mark.long
 @settings(max_examples=30)
 @given(st.integers(3, 60), st.integers(3, 60), st.floats(0.1, 10), st.integers(0, 99))
-def test_returns_have_students_interval(n, m, spread, seed):
+def test_return_interval_matches_student_t(n, m, spread, seed):
     rng = np.random.default_rng(seed)
     a, b, c = rng.normal(0, 1, n), rng.normal(3, spread, m), rng.normal(0, 1, m)
     for row, test in (
@@ -251,13 +256,13 @@ def test_returns_have_students_interval(n, m, spread, seed):
         assert found[0] + found[1] == pytest.approx(low + high)
 
 
-def test_returns_that_do_not_vary_are_told_apart():
+def test_constant_returns_are_ordered():
     row = ordered([2.0] * 30, [1.0] * 30)
     assert (row["verdict"], row["more_return"]) == ("agrees", [1.0, 1.0])
 
 
 @pytest.mark.parametrize("paired", [True, False])
-def test_differences_of_success_end_at_one(paired):
+def test_success_difference_is_within_one(paired):
     for count in (1, 3, 30):
         low, high = ordered(range(count), range(count), paired=paired)["more_success"]
         assert -1 <= low < high <= 1
@@ -268,7 +273,7 @@ def test_differences_of_success_end_at_one(paired):
     st.tuples(st.integers(1, 60), st.integers(0, 60)),
     st.tuples(st.integers(1, 60), st.integers(0, 60)),
 )
-def test_the_difference_of_success_has_newcombes_interval(first, second):
+def test_success_difference_has_newcombe_interval(first, second):
     (n, k), (m, j) = ((total, min(hits, total)) for total, hits in (first, second))
     row = ordered(range(n), range(m), success=(k / n, j / m), min_episodes=1)
     (a, total_a), (b, total_b) = ((k, n), (j, m)) if row["driver"] == "a" else ((j, m), (k, n))

@@ -49,7 +49,7 @@ class Drive:
 
 
 def oracle(steps: list[dict[str, Any]], discount: float, n_step: int) -> dict[tuple[int, int], Any]:
-    """(env, first step) -> the packed row, for every row that is complete."""
+    """Return the packed rows of all complete steps by (env, first step)."""
     found = {}
     for env in range(len(steps[0]["action"])):
         for first in range(len(steps)):
@@ -80,7 +80,7 @@ def oracle(steps: list[dict[str, Any]], discount: float, n_step: int) -> dict[tu
     steps=st.integers(1, 25),
     seed=st.integers(0, 2**32),
 )
-def test_rows_are_those_of_a_naive_n_step_oracle(num_envs, n_step, steps, seed):
+def test_rows_match_naive_n_step_oracle(num_envs, n_step, steps, seed):
     ring = FreshRing(500, num_envs, SIZE, discount=0.9, n_step=n_step)
     drive = Drive(num_envs, seed)
     keys = []
@@ -109,7 +109,7 @@ def test_rows_are_those_of_a_naive_n_step_oracle(num_envs, n_step, steps, seed):
 def filled(
     capacity: int = 40, steps: int = 60, seed: int = 0, n_step: int = 3
 ) -> tuple[FreshRing, Drive]:
-    """Return a ring after some steps, ended episodes labelled by the parity of their step."""
+    """Return a ring after some steps; ended episodes are labelled by step parity."""
     ring = FreshRing(capacity, 2, SIZE, discount=0.9, n_step=n_step, conditions=CONDITIONS)
     drive = Drive(2, seed)
     advance(ring, drive, steps)
@@ -124,7 +124,7 @@ def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
             ring.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
 
 
-def test_labels_put_rows_in_strata_and_eviction_takes_them_out():
+def test_strata_follow_labels_and_eviction():
     ring, _ = filled(capacity=30, steps=200)
     ended = ~np.isin(ring.meta["episode"][: len(ring)], ring.episode_key)
     codes = ring.condition(np.arange(len(ring)))
@@ -147,7 +147,7 @@ def assert_alike(one: FreshRing, other: FreshRing) -> None:
 
 @pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
 @pytest.mark.parametrize("reserved", [{}, {"wheel_slip": 20}])
-def test_a_restored_ring_goes_on_exactly(steps, reserved):
+def test_restored_ring_continues_exactly(steps, reserved):
     ring, drive = reserving(seed=5, **reserved)
     label_rarely(ring, drive, steps)
     other, _ = reserving(seed=5, **reserved)
@@ -161,7 +161,7 @@ def test_a_restored_ring_goes_on_exactly(steps, reserved):
         np.testing.assert_array_equal(one, two)
 
 
-def test_wrong_labels_are_refused():
+def test_invalid_labels_are_refused():
     ring = FreshRing(50, 1, SIZE, discount=0.9, conditions=CONDITIONS)
     drive = Drive(1, 0)
     key = -1
@@ -183,7 +183,7 @@ def reserving(
 
 
 def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
-    """One episode in ten is of wheel slip, all others are nominal."""
+    """Drive some steps; label one episode in ten as wheel slip and all others as nominal."""
     for _ in range(steps):
         step = drive.step()
         keys = ring.append(**step, env_step=len(drive.steps), gradient_step=0)
@@ -191,18 +191,18 @@ def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
             ring.set_labels(key, np.full(500, 0 if key % 10 == 0 else 2))
 
 
-def test_rare_rows_are_not_washed_out_where_they_are_reserved():
+def test_reserved_rare_rows_are_not_evicted():
     plain, drive = reserving(seed=3)
     label_rarely(plain, drive, 1500)
     kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
     label_rarely(kept, drive, 1500)
     assert plain.by_condition.counts[0] < 15
     assert 25 <= kept.by_condition.counts[0] <= 60
-    # What is not used of a reserve is anybody's; nominal rows stay the newest there are.
+    # Unused reserves serve all conditions; nominal rows are the newest.
     assert kept.by_condition.counts[2] >= 20
     newest = np.sort(kept.meta["env_step"][kept.by_condition.members(2)])[-10:]
     assert newest.min() > len(drive.steps) - 40
-    # Of the rare ones, too, the oldest went first.
+    # The oldest rare rows were evicted first, too.
     slips = kept.meta["env_step"][kept.by_condition.members(0)]
     assert slips.min() > 100
 
@@ -214,7 +214,7 @@ def test_rare_rows_are_not_washed_out_where_they_are_reserved():
     parts=st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 4)),
     seed=st.integers(0, 2**32),
 )
-def test_a_ring_with_reserves_stays_whole(capacity, steps, parts, seed):
+def test_ring_with_reserves_stays_consistent(capacity, steps, parts, seed):
     reserved = {
         name: part * capacity // max(sum(parts), 1)
         for name, part in zip(CONDITIONS, parts, strict=True)
@@ -226,7 +226,7 @@ def test_a_ring_with_reserves_stays_whole(capacity, steps, parts, seed):
     codes = ring.condition(np.arange(filled))
     for code in range(3):
         assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
-    # Every row is a step of its own, and as it was when it was appended.
+    # Every row is a distinct step, unchanged since it was appended.
     key = (ring.meta["episode"][:filled] << 20) + ring.meta["episode_step"][:filled]
     assert len(np.unique(key)) == filled
     expected = oracle(drive.steps, 0.9, 3)
@@ -237,13 +237,13 @@ def test_a_ring_with_reserves_stays_whole(capacity, steps, parts, seed):
 
 
 @pytest.mark.parametrize("reserved", [{"wheel_slip": 40, "nominal": 30}, {"unheard_of": 1}])
-def test_what_cannot_be_reserved_is_refused(reserved):
+def test_invalid_reserves_are_refused(reserved):
     with pytest.raises(MixtureError, match="cannot be reserved"):
         reserving(60, **reserved)
 
 
 @pytest.mark.parametrize("other", [{"capacity": 61}, {"wheel_slip": 20}])
-def test_a_state_of_another_ring_is_refused(other):
+def test_state_of_other_ring_is_refused(other):
     ring, _ = reserving(60, wheel_slip=40)
     with pytest.raises(MixtureError, match=r"another shape|reserved"):
         reserving(**other)[0].load_state_dict(ring.state_dict())

@@ -1,4 +1,4 @@
-"""Candidates put in order: the same table whatever batches their rows came in."""
+"""Ordered candidates: the same table for any batches of their rows."""
 
 import itertools
 
@@ -63,9 +63,7 @@ def check(found: pa.Table, table: pa.Table) -> None:
     st.randoms(use_true_random=False),
     st.sampled_from(["files", "batches", "rows"]),
 )
-def test_any_batches_in_any_order_give_the_same_table(
-    recordings, episodes, steps, cuts, random, mixed
-):
+def test_batches_in_any_order_give_same_table(recordings, episodes, steps, cuts, random, mixed):
     table = rows_of(recordings, episodes, steps)
     if mixed == "rows":
         order = list(range(len(table)))
@@ -83,7 +81,7 @@ def test_any_batches_in_any_order_give_the_same_table(
 
 
 @pytest.mark.parametrize("names", [1, 127, 128, 129, 32_768, 32_769])
-def test_codes_are_as_wide_as_their_dictionary_needs(names):
+def test_code_width_fits_dictionary(names):
     count = names + 3
     table = pa.table(
         {
@@ -102,6 +100,6 @@ def test_codes_are_as_wide_as_their_dictionary_needs(names):
     assert found["episode_id"].type.index_type.bit_width == bits
 
 
-def test_no_rows():
+def test_no_batches_give_empty_table():
     table = rows_of(1, 1, 1).slice(0, 0)
     assert in_order([], table.schema).num_rows == 0

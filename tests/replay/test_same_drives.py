@@ -1,4 +1,4 @@
-"""Recordings that hold one drive, and numbers that come twice, as plain loops find them."""
+"""Recordings of the same drive, and repeated numbers, compared with plain loops."""
 
 from collections import defaultdict
 from itertools import combinations
@@ -23,7 +23,7 @@ from restock.replay.store.same_drives import (
 Row = tuple[int, int, int]  # recording, content, stamp
 
 
-def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
+def find_by_loop(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
     found: dict[tuple[int, int], list[int]] = defaultdict(list)
     for recording, content, stamp in rows:
         found[recording, content].append(stamp)
@@ -57,7 +57,7 @@ def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
         max_size=60,
     )
 )
-def test_they_are_those_of_the_definition(rows):
+def test_same_drives_match_plain_loop(rows):
     recording, content, stamp = np.array(rows, np.int64).reshape(-1, 3).T
     table = same_drives(
         MovingRows(
@@ -70,7 +70,7 @@ def test_they_are_those_of_the_definition(rows):
     columns = ("recording_id", "same_as", "rows", "share", "later_s")
     found = list(zip(*(table[name].to_pylist() for name in columns), strict=True))
     assert len(found) == len(set(found))
-    assert set(found) == looped(rows)
+    assert set(found) == find_by_loop(rows)
 
 
 NUMBERS = st.integers(-(2**63), 2**63 - 1)
@@ -78,7 +78,7 @@ NUMBERS = st.integers(-(2**63), 2**63 - 1)
 
 @settings(max_examples=200)
 @given(st.lists(st.lists(st.one_of(NUMBERS, st.integers(0, 9)), max_size=40), max_size=6))
-def test_none_that_comes_again_is_missed(parts):
+def test_repeat_filter_misses_no_repeat(parts):
     arrays = [np.array(part, np.int64) for part in parts]
     observed = RepeatFilter(sum(map(len, parts)))
     for part in arrays:
@@ -90,7 +90,7 @@ def test_none_that_comes_again_is_missed(parts):
     assert not (exact & ~maybe).any()
 
 
-def test_of_many_that_come_once_few_are_taken_for_others():
+def test_repeat_filter_has_few_false_positives():
     count = 20 * MARKED + 5
     values = np.random.default_rng(0).integers(-(2**63), 2**63 - 1, count)
     copies = np.concatenate([values, values[:100], values[MARKED - 3 : MARKED + 3]])

@@ -1,8 +1,7 @@
-"""However one draws from a panel, the mixture's rules hold, or it is refused with a remedy."""
+"""Every way of drawing from a panel keeps the mixture's rules, or is refused with a remedy."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -47,12 +46,12 @@ class Drawn:
 
 
 Way = Callable[[Panel], Iterator[Drawn]]
-ERRS = 3.0  # |TD| of what errs, where the rest has 0.1
+LARGE_TD = 3.0  # other rows have 0.1
 
 
-def learn(sampler: Any, rows: np.ndarray, strata: np.ndarray) -> np.ndarray:
-    """|TD| by stratum and row: stratum 0 errs, and in every stratum the even rows."""
-    return np.where((strata == 0) | (rows % 2 == 0), ERRS, 0.1).astype(np.float32)
+def td_errors(rows: np.ndarray, strata: np.ndarray) -> np.ndarray:
+    """Return |TD| (B,), large in stratum 0 and in even rows."""
+    return np.where((strata == 0) | (rows % 2 == 0), LARGE_TD, 0.1).astype(np.float32)
 
 
 def by_sampler(make: Callable[[Panel], LoggedSampler]) -> Way:
@@ -67,7 +66,7 @@ def by_sampler(make: Callable[[Panel], LoggedSampler]) -> Way:
             sampler.gather(batch.rows, packed)
             np.testing.assert_array_equal(packed, panel.rows[batch.rows])
             yield Drawn(batch.rows, batch.strata)
-            sampler.update(batch.rows, learn(sampler, batch.rows, batch.strata))
+            sampler.update(batch.rows, td_errors(batch.rows, batch.strata))
             number += 1
 
     return draw
@@ -81,7 +80,7 @@ def by_batches(panel: Panel) -> Iterator[Drawn]:
         batch = batches.draw_online(number * 10)
         np.testing.assert_array_equal(batch.rows.numpy(), panel.rows[batch.log_rows])
         yield Drawn(batch.log_rows, batch.log_stratum)
-        td = learn(None, batch.log_rows, batch.log_stratum)
+        td = td_errors(batch.log_rows, batch.log_stratum)
         batches.note_errors(batch, torch.from_numpy(td))
 
 
@@ -92,7 +91,7 @@ def by_library(reported: bool) -> Way:
         for _ in range(10**9):
             batch = feed.draw_logs(BATCH)
             yield Drawn(batch.rows, batch.strata)
-            td = learn(None, batch.rows, batch.strata) if reported else None
+            td = td_errors(batch.rows, batch.strata) if reported else None
             feed.drawn(panel.rows[batch.rows], batch, np.empty(0, np.int64), td=td)
 
     return draw
@@ -125,7 +124,7 @@ def panels(tmp_path_factory) -> Callable[[str], Panel]:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", MIXTURES)
-def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(panels, name, way):
+def test_mixture_rules_hold_or_draw_is_refused(panels, name, way):
     panel = panels(name)
     limit = panel.header.mixture.max_replays_per_row
     batches: list[Drawn] = []
@@ -166,12 +165,12 @@ def _check_within(panel: Panel, name: str, batches: list[Drawn], counted: np.nda
         if stratum.within == "per" and len(members) > 20:
             even = members % 2 == 0
             of_even, of_odd = counted[members[even]].mean(), counted[members[~even]].mean()
-            errs_alike = stratum.name == panel.strata[0].name
-            assert errs_alike or of_even > 1.5 * of_odd, stratum.name
+            all_large = stratum.name == panel.strata[0].name
+            assert all_large or of_even > 1.5 * of_odd, stratum.name
 
 
 def _check_shares(panel: Panel, batches: list[Drawn]) -> None:
-    """Every batch has the quota of every stratum, the rounding carried on."""
+    """Check that batches meet the quota of every stratum, with rounding carried over."""
     size = len(panel.strata)
     quotas = np.array([np.bincount(batch.strata, minlength=size) for batch in batches])
     shares = np.array([stratum.share for stratum in panel.strata])
@@ -179,7 +178,7 @@ def _check_shares(panel: Panel, batches: list[Drawn]) -> None:
     assert np.abs(owed).max() < 2
 
 
-def test_draws_of_a_panel_go_on_where_they_were_saved(panels):
+def test_restored_draws_of_panel_continue_exactly(panels):
     panel = panels("limited per")
     one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
 
@@ -187,7 +186,7 @@ def test_draws_of_a_panel_go_on_where_they_were_saved(panels):
         found = []
         for _ in range(batches):
             batch = sampler.draw()
-            sampler.update(batch.rows, learn(None, batch.rows, batch.strata))
+            sampler.update(batch.rows, td_errors(batch.rows, batch.strata))
             found.append(batch.rows.tolist())
         return found
 

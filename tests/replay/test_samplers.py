@@ -28,7 +28,7 @@ PER = Prioritised(per_alpha=0.7)
 
 
 class Drawing:
-    """One sampler, with copies of what it draws."""
+    """A sampler whose draws are copied."""
 
     def __init__(self, sampler: Any) -> None:
         self.sampler = sampler
@@ -62,22 +62,22 @@ def make(way: str) -> Make:
 
 
 def in_turns(way: str) -> list[np.ndarray]:
-    """Return the strata whose rows have turns."""
+    """Return the strata whose rows are drawn without replacement."""
     named = zip(STRATA, RULES[way], strict=True)
     return [rows for rows, rule in named if rule == "without_replacement"]
 
 
 def errors() -> np.ndarray:
-    """|TD| of each row (400,), over three orders of magnitude."""
+    """Return |TD| of each row (400,), over three orders of magnitude."""
     return 10 ** np.random.default_rng(5).uniform(-2, 1, 400)
 
 
 def priority(rule: str, td_abs: np.ndarray) -> np.ndarray:
-    """Return priorities as the paper has them; 1 for other rules."""
+    """Return priorities as in the PER paper; 1 for other rules."""
     return (td_abs + EPSILON) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
 
 
-def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make, way):
+def test_quotas_are_exact_and_rows_follow_rule(make, way):
     drawing, td = make(batch_size=40), errors()  # 28 and 12
     for rows in STRATA:
         drawing.update(rows, td[rows])
@@ -97,10 +97,10 @@ def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make, way):
     assert counts.sum() == 160_000
 
 
-@pytest.mark.parametrize("before", [0, 3, 107])  # on the way, what was drawn ahead is given back
-def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
+@pytest.mark.parametrize("before", [0, 3, 107])  # after 107, rows drawn ahead were returned
+def test_restored_sampler_continues_exactly(make, tmp_path, before):
     def go_on(drawing: Drawing, batches: int, seed: int) -> list[Any]:
-        seen: list[Any] = []
+        observed: list[Any] = []
         rng = np.random.default_rng(seed)
         for index in range(batches):
             if index == 100:
@@ -108,10 +108,10 @@ def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
             if index == 105:
                 drawing.sampler.set_batch_size(31)
             drawn, stratum, weights = drawing.draw()
-            seen += [drawn.tolist(), stratum.tolist()]
-            seen.append(None if weights is None else weights.tolist())
+            observed += [drawn.tolist(), stratum.tolist()]
+            observed.append(None if weights is None else weights.tolist())
             drawing.update(drawn, rng.uniform(0, 9, len(drawn)))
-        return seen
+        return observed
 
     first, second, third = make(1), make(2), make(3)
     go_on(first, before, seed=1)
@@ -125,7 +125,7 @@ def test_a_restored_sampler_goes_on_exactly(make, tmp_path, before):
     assert go_on(third, 250, seed=2) == expected
 
 
-def test_a_state_of_another_rule_is_refused():
+def test_state_of_other_rule_is_refused():
     def sampler(within: str) -> QuotaSampler:
         return QuotaSampler(STRATA, SHARES, 50, np.random.default_rng(0), within=within)
 
@@ -137,7 +137,7 @@ def test_a_state_of_another_rule_is_refused():
 
 @settings(max_examples=150)
 @given(parts=PARTS, batch_size=st.integers(1, 300), draws=st.integers(1, 200))
-def test_every_batch_is_full_and_every_share_is_met_over_time(parts, batch_size, draws):
+def test_batches_are_full_and_shares_met_over_time(parts, batch_size, draws):
     shares = np.array(parts) / sum(parts)
     quotas = Quotas(shares, batch_size)
     total = np.zeros(len(shares))
@@ -157,7 +157,7 @@ def test_every_batch_is_full_and_every_share_is_met_over_time(parts, batch_size,
     within=st.sampled_from(["uniform", "without_replacement"]),
     seed=st.integers(0, 2**32),
 )
-def test_what_is_owed_stays_within_rows_when_shares_change(steps, within, seed):
+def test_share_error_is_bounded_when_shares_change(steps, within, seed):
     rows = [np.arange(0, 30), np.arange(30, 41), np.arange(41, 60)]
     sampler = QuotaSampler(rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), within=within)
     counts, wanted, total = np.zeros(60), np.zeros(3), np.zeros(3)
@@ -173,9 +173,9 @@ def test_what_is_owed_stays_within_rows_when_shares_change(steps, within, seed):
             np.add.at(counts, drawn, 1)
             total += quota
             wanted += shares * batch_size
-            # A stratum whose share goes to 0 forfeits what it is owed: less than a row a change.
+            # A stratum whose share becomes 0 forfeits its remainder: less than a row per change.
             assert np.abs(total - wanted).max() < 3.0 + len(steps)
-        if within == "without_replacement":  # what was drawn ahead and given back is no turn
+        if within == "without_replacement":  # rows drawn ahead and returned do not count
             assert all(np.ptp(counts[members]) <= 1 for members in rows)
 
 
@@ -183,6 +183,6 @@ def test_what_is_owed_stays_within_rows_when_shares_change(steps, within, seed):
     ("shares", "message"),
     [([0.5, 0.4], "sum to 1"), ([1.5, -0.5], "not negative"), ([1.0, np.nan], "finite")],
 )
-def test_shares_that_are_no_distribution_are_refused(shares, message):
+def test_invalid_shares_are_refused(shares, message):
     with pytest.raises(MixtureError, match=message):
         Quotas(shares, 8)

@@ -1,4 +1,4 @@
-"""Shares sum to one, hold floors and caps, and ask of rows no more than they bear."""
+"""Shares sum to one, keep floors and caps, and stay within the replay limits of the rows."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_wanted_shares_sum_to_one_within_floors_and_caps(given_rules, data):
 
 @settings(max_examples=300)
 @given(st.data())
-def test_no_stratum_gives_more_than_its_rows_can_bear(data):
+def test_shares_stay_within_limits_of_rows(data):
     count = data.draw(st.integers(1, 7))
     parts = [np.array([data.draw(PARTS) for _ in range(count)]) for _ in range(3)]
     wanted, limit, caps = parts
@@ -75,10 +75,10 @@ def test_no_stratum_gives_more_than_its_rows_can_bear(data):
     if (wanted <= limit + 1e-12).all():
         np.testing.assert_allclose(plan.got, wanted)
     if shortfall == "redistribute":
-        # No stratum was lifted above its cap, and nothing was left lying that could be given.
-        lifted = plan.got * plan.scale > wanted + 1e-6
-        assert (plan.got * plan.scale)[lifted] == pytest.approx(
-            np.minimum(plan.got * plan.scale, caps)[lifted], abs=1e-6
+        # No stratum was raised above its cap, and no room was left unused.
+        raised = plan.got * plan.scale > wanted + 1e-6
+        assert (plan.got * plan.scale)[raised] == pytest.approx(
+            np.minimum(plan.got * plan.scale, caps)[raised], abs=1e-6
         )
         room = np.maximum(np.minimum(limit, caps) - plan.got * plan.scale, 0)
         assert plan.scale == pytest.approx(1, abs=1e-6) or room.sum() < 1e-6
@@ -86,7 +86,7 @@ def test_no_stratum_gives_more_than_its_rows_can_bear(data):
 
 @settings(max_examples=200)
 @given(st.data())
-def test_priorities_part_the_rows(data):
+def test_rows_are_assigned_by_priority(data):
     count, size = data.draw(st.integers(0, 30)), data.draw(st.integers(1, 5))
     flags = data.draw(st.lists(st.booleans(), min_size=count * size, max_size=count * size))
     member = np.array(flags, np.bool_).reshape(count, size)

@@ -1,4 +1,4 @@
-"""A store of one episode: every shipped mixture packs it, and says what is held out."""
+"""A store of one episode: every shipped mixture packs it and reports the evaluation split."""
 
 import re
 
@@ -17,7 +17,7 @@ SEED = 3  # of an episode of 58 steps
 
 
 def drive(steps: int) -> pa.Table:
-    """One episode, cut short."""
+    """Return the first steps of one episode."""
     table = recording_transitions(1, episodes=1, seed=SEED)
     assert len(table) >= steps
     return table.slice(0, steps)
@@ -27,8 +27,8 @@ def drive(steps: int) -> pa.Table:
 def test_every_shipped_mixture_packs_one_episode(name, tmp_path, shell):
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
     options = ["--mixture", name, "--out", str(tmp_path / "panel")]
-    said = shell.out("mix", store, *options)
-    assert "held out: the last 10% of the one episode there is, after a gap of 2 s" in said
+    text = shell.out("mix", store, *options)
+    assert "held out: the last 10% of the one episode there is, after a gap of 2 s" in text
     panel = Panel.open(tmp_path / "panel", verify=True)
     assert panel.header.split_by == "within_episode"
     assert panel.header.left_out["gap before the evaluation split"] >= 9  # 2 s of .2 s, jitter off
@@ -41,23 +41,23 @@ def test_every_shipped_mixture_packs_one_episode(name, tmp_path, shell):
     assert found["leakage"]["status"] == "pass"
 
 
-def test_wanted_is_a_share_of_a_batch_in_the_table(tmp_path, shell):
-    """Of few rows a stratum may be short, and yet more of the logged rows than was wanted."""
+def test_mix_table_states_what_shares_refer_to(tmp_path, shell):
+    """A stratum can be short of rows, and yet a larger part of the logged rows than wanted."""
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
-    said = shell.out("mix", store, "--dry-run")
+    text = shell.out("mix", store, "--dry-run")
     fill = r"logged rows fill \d\.\d% of a batch, not 50\.0% \(\[sources\]\): there are not enough"
-    assert re.search(fill, said)
-    (header,) = (line for line in said.splitlines() if "wanted: %" in line)
+    assert re.search(fill, text)
+    (header,) = (line for line in text.splitlines() if "wanted: %" in line)
     assert re.search(r"natural: % +wanted: % +drawn: % of +% of their", header)
-    assert re.search(r"stratum .* of rows +of a batch +logged rows +gradient", said)
-    (nominal,) = (line.split() for line in said.splitlines() if line.startswith(" nominal "))
+    assert re.search(r"stratum .* of rows +of a batch +logged rows +gradient", text)
+    (nominal,) = (line.split() for line in text.splitlines() if line.startswith(" nominal "))
     assert nominal[4] == "40"
-    short = [line for line in said.splitlines() if ": short of rows" in line]
+    short = [line for line in text.splitlines() if ": short of rows" in line]
     assert len(short) >= 4
     assert not any("%" in line for line in short)
 
 
-def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path, shell):
+def test_episode_too_short_to_split_is_used_whole(tmp_path, shell):
     store = write_store(tmp_path / "store", [drive(20)], task=TASK)
     options = ["--mixture", "uniform", "--out", tmp_path / "panel"]
     document = shell.json("mix", store, *options)
@@ -73,7 +73,7 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path, shell):
     share=st.floats(0.05, 0.5),
     n_step=st.integers(1, 8),
 )
-def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, n_step):
+def test_training_returns_end_before_held_out_rows(lengths, share, n_step):
     table = table_of(*lengths)
     step, names = table["step_index"].to_numpy(), table["episode_id"].to_pylist()
     split = f'by = "within_episode", share = {share}'
@@ -101,8 +101,8 @@ def table_of(*lengths: int) -> pa.Table:
     return pa.table({"episode_id": pa.array(names).dictionary_encode(), **columns})
 
 
-def test_of_few_episodes_the_end_of_the_longest_is_held_out():
-    """A whole one of two was half of the rows, and all there was of its conditions."""
+def test_few_episodes_hold_out_end_of_longest():
+    """One of two whole episodes would be half of the rows, and all rows of its conditions."""
     mixture = parse_mixture("[each_condition]\nshare = 'natural'", where="test")
     table = table_of(180, 205)
     rows = split_for_evaluation(table, mixture)
@@ -112,7 +112,7 @@ def test_of_few_episodes_the_end_of_the_longest_is_held_out():
     assert not (rows.held | rows.gap)[:180].any()
     assert rows.held[-1]
     assert rows.gap.sum() in (10, 11)
-    for lengths in ((40,) * 12, (9, 10)):  # enough of them; and too short for a gap
+    for lengths in ((40,) * 12, (9, 10)):  # enough episodes; episodes too short for a gap
         rows = split_for_evaluation(table_of(*lengths), mixture)
         assert rows.by == "episode"
         assert not rows.gap.any()

@@ -25,7 +25,7 @@ from restock.train.run.run import Run
 
 @pytest.fixture
 def run_dir(tmp_path) -> Path:
-    """Return a run directory as far as SQL looks at it."""
+    """Return a run directory with the tables that SQL reads."""
     path = tmp_path / "run"
     (path / "eval").mkdir(parents=True)
     (path / "config.json").write_text("{}")
@@ -46,8 +46,8 @@ def test_json_is_a_list_of_row_objects(store_path, shell, transitions):
     ]
 
 
-def test_decimals_are_numbers_and_columns_keep_their_values(store_path, shell):
-    """A script would compare "278.2" as text; and of two columns `a`, both were the second's."""
+def test_decimals_and_repeated_column_names(store_path, shell):
+    """Regressions: decimals were strings, and two columns `a` both had the second one's values."""
     query = "SELECT 2782 * 0.1 AS s, 2.50 * 2 AS whole, 1 AS a, 2 AS a_1, 3 AS a, 4 AS a"
     rows = shell.json("sql", store_path, query)
     assert rows == [{"s": 278.2, "whole": 5, "a": 1, "a_1": 2, "a_2": 3, "a_3": 4}]
@@ -58,13 +58,13 @@ def test_decimals_are_numbers_and_columns_keep_their_values(store_path, shell):
     assert lines.splitlines()[2].split() == ["1", "2", "1,234,568", "-600,000"]
 
 
-def test_times_with_a_zone_are_text_in_utc(store_path, shell):
+def test_times_with_zone_are_text_in_utc(store_path, shell):
     query = "SELECT ingested_at, ingested_at AS again FROM recordings LIMIT 1"
     rows = shell.json("sql", store_path, query)
     assert rows == [{"ingested_at": "2026-01-01 00:00:00Z", "again": "2026-01-01 00:00:00Z"}]
 
 
-def test_csv_has_a_header_even_without_rows(store_path, shell):
+def test_csv_has_header_without_rows(store_path, shell):
     text = shell.out("sql", store_path, "SELECT condition, rows_held FROM ages", "--csv")
     found = list(csv.DictReader(io.StringIO(text)))
     assert {row["condition"] for row in found} >= {"nominal", "wheel_slip"}
@@ -72,18 +72,18 @@ def test_csv_has_a_header_even_without_rows(store_path, shell):
     assert shell.out("sql", store_path, query, "--csv") == "condition,rows_held\n"
 
 
-def test_a_query_comes_from_stdin(store_path, shell, monkeypatch):
+def test_query_is_read_from_stdin(store_path, shell, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("SELECT 1 AS one;\nSELECT 2 AS two"))
     assert shell.json("sql", store_path, "-") == [{"two": 2}]
 
 
-def test_a_run_is_queried_by_its_tables(run_dir, shell):
+def test_run_tables_can_be_queried(run_dir, shell):
     assert shell.json("sql", run_dir, "FROM progress") == [{"env_steps": 10, "loss": 0.5}]
     assert "dqn" in shell.out("sql", run_dir, "FROM eval_episodes")
     assert "gradient_step" in shell.out("sql", run_dir, "FROM columns")
 
 
-def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, shell):
+def test_run_columns_are_documented(tmp_path, shell):
     Run.create(tmp_path / "run", {})
     query = "SELECT * FROM columns WHERE column_name = 'row_hash'"
     assert shell.json("sql", tmp_path / "run", query) == [
@@ -98,7 +98,7 @@ def test_a_runs_columns_are_listed_with_their_meanings(tmp_path, shell):
     assert shell.json("sql", tmp_path / "run", undocumented) == [{"n": 0}]
 
 
-def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, shell, transitions):
+def test_sampled_rows_join_logged_transitions(store_path, run_dir, shell, transitions):
     query = (
         "SELECT transition_id, source_file FROM run.audit JOIN transitions USING (transition_id)"
         " ORDER BY ALL"
@@ -109,7 +109,7 @@ def test_what_was_sampled_joins_what_was_logged(store_path, run_dir, shell, tran
     ]
 
 
-def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, shell):
+def test_panel_tables_can_be_queried(store_path, tmp_path, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     query = "SELECT sum(rows) AS rows FROM strata"
     assert shell.json("sql", panel.path, query) == [{"rows": len(panel)}]
@@ -123,16 +123,16 @@ def test_a_panel_is_queried_by_its_tables(store_path, tmp_path, shell):
     [
         ("FROM coverag", "Did you mean"),
         ("SELECT 'a'::INT", "Could not convert"),
-        ("FROM ages_at('2026-12-01')", "\n    epoch_ns("),  # its tabs were written out
+        ("FROM ages_at('2026-12-01')", "\n    epoch_ns("),  # tabs were printed as escapes
     ],
 )
-def test_wrong_sql_is_one_message_and_exit_2(store_path, shell, query, message):
+def test_invalid_sql_exits_2_without_traceback(store_path, shell, query, message):
     err = shell.err("sql", store_path, query)
     assert message in err
     assert "Traceback" not in err
 
 
-def test_a_view_that_a_panel_lacks_is_not_duckdbs_own(tmp_path, store_path, shell):
+def test_missing_panel_view_suggests_no_internal_table(tmp_path, store_path, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     err = shell.err("sql", panel.path, "FROM transitions")
     assert "does not exist" in err
@@ -140,7 +140,7 @@ def test_a_view_that_a_panel_lacks_is_not_duckdbs_own(tmp_path, store_path, shel
     assert 'try "FROM columns"' in shell.err("sql", panel.path, "")
 
 
-def test_wrong_places_are_refused(tmp_path, store_path, run_dir, shell):
+def test_invalid_places_are_refused(tmp_path, store_path, run_dir, shell):
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p").path
     for place, words, problem in (
         (tmp_path, [], "it is not a store"),
@@ -154,7 +154,7 @@ def test_wrong_places_are_refused(tmp_path, store_path, run_dir, shell):
         assert problem in shell.err("sql", place, *words, "SELECT 1")
 
 
-def test_without_a_query_there_is_a_prompt(store_path, monkeypatch, shell):
+def test_prompt_without_query(store_path, monkeypatch, shell):
     lines = iter(["SELECT 41 + 1", "AS answer;", "FROM nope;", "SELECT 7 AS seven;"])
 
     def answer(prompt: str) -> str:
@@ -170,7 +170,7 @@ def test_without_a_query_there_is_a_prompt(store_path, monkeypatch, shell):
     assert "nope" in err
 
 
-def test_the_prompt_has_help_and_lists_tables(store_path, monkeypatch, shell):
+def test_prompt_has_help_and_lists_tables(store_path, monkeypatch, shell):
     lines = iter([".help", ".tables", r"SELECT 7 AS seven \G", ".quit"])
     monkeypatch.setattr("builtins.input", lambda prompt: next(lines))
     monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
@@ -181,7 +181,7 @@ def test_the_prompt_has_help_and_lists_tables(store_path, monkeypatch, shell):
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv", "json"])
-def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, shell, ending):
+def test_export_format_follows_file_ending(store_path, tmp_path, shell, ending):
     out = tmp_path / f"rows.{ending}"
     query = "SELECT range::INT AS n, '=' || range AS text, {'a': [range]} AS nested FROM range(2)"
     line = ["sql", str(store_path), query, "--export", str(out)]
@@ -200,14 +200,14 @@ def test_rows_are_written_to_a_file_by_its_ending(store_path, tmp_path, shell, e
 
 
 @pytest.mark.parametrize("name", one_in(2, ["views.sql", "views.duckdb"]))
-def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, shell, name):
+def test_exported_views_work_in_plain_duckdb(store_path, tmp_path, shell, name):
     out = tmp_path / name
     assert cli.main(["sql", str(store_path), "--export", str(out)]) == 0
     assert [path.name for path in tmp_path.iterdir()] == [name]
     with Store(store_path) as store:
         questions = ["FROM coverage", "FROM episodes ORDER BY ALL", "FROM cells_below(9)"]
         questions += ["SELECT typeof(observation) FROM transitions LIMIT 1"]
-        # Frames lie in files of their own, which no export names.
+        # Frames are in separate files, which exports leave out.
         questions += ["FROM columns WHERE NOT contains(view, 'frames') ORDER BY ALL"]
         expected = [store.sql(question).fetchall() for question in questions]
     with duckdb.connect(str(out) if name.endswith("duckdb") else ":memory:") as other:
@@ -223,11 +223,11 @@ def test_any_duckdb_sees_the_exported_views(store_path, tmp_path, shell, name):
         assert problem in shell.err("sql", store_path, *words)
 
 
-def test_ctrl_c_stops_a_query_at_once(store_path):
+def test_ctrl_c_stops_query(store_path):
     endless = "SELECT count(*) FROM range(100000000) a, range(100000000) b WHERE a.range % 7 = 3"
     command = [sys.executable, "-m", "restock", "sql", str(store_path), endless]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    # The query runs once DuckDB burns time; a signal before that is handled as well.
+    # The query is running once DuckDB uses CPU time; an earlier signal is handled as well.
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and _cpu_seconds(process.pid) < 2.0:
         time.sleep(0.1)

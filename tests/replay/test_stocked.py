@@ -1,4 +1,4 @@
-"""A mixture that stocks: nothing corrected below its natural share, and what is missing is told."""
+"""No stratum is corrected below its natural share, and missing rows are reported."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ THRESHOLDS = load_thresholds()
 EQUAL = "planned_draws = 6400\n[each_condition]\nshare = 'equal'\n"
 
 
-def test_a_correction_below_a_natural_share_is_refused(transitions):
+def test_correction_below_natural_share_is_refused(transitions):
     full = "[correction]\npost = 'full'\n"
     with pytest.raises(MixtureError) as refused:
         planned(transitions, EQUAL + full)
@@ -42,8 +42,8 @@ def test_a_correction_below_a_natural_share_is_refused(transitions):
 
 
 @pytest.mark.parametrize("post", ["none", "full", "clipped", "density_ratio"])
-def test_what_a_quota_takes_is_the_users_wish(transitions, post):
-    """No boost and no refusal by rounding; and a cap below the natural share is no correction."""
+def test_cap_below_natural_share_is_accepted(transitions, post):
+    """Natural shares are not refused for rounding, and a cap below them is not a correction."""
     natural = planned(transitions, f"[correction]\npost = '{post}'\npre = 'full'\n" + EVERY)
     for line in natural.strata:
         assert line.effective_share == pytest.approx(line.natural_share, rel=1e-4)
@@ -56,7 +56,7 @@ def test_what_a_quota_takes_is_the_users_wish(transitions, post):
     assert slip.effective_share > 0.99 * slip.share
 
 
-def strata_of_episodes(count: int) -> list[ResolvedStratum]:
+def episode_strata(count: int) -> list[ResolvedStratum]:
     rules = [StratumRule(name=f"s{i}", unit="episode") for i in range(count)]
     rules.append(StratumRule(name="nominal", unit="episode"))
     return [ResolvedStratum(rule, "true", None, i, "pre", "none") for i, rule in enumerate(rules)]
@@ -64,14 +64,14 @@ def strata_of_episodes(count: int) -> list[ResolvedStratum]:
 
 @settings(max_examples=150)
 @given(st.data())
-def test_every_condition_has_an_episode_of_its_own_if_it_can(data):
+def test_every_stratum_gets_episode_if_possible(data):
     count = data.draw(st.integers(1, 5), label="strata")
     sets = st.frozensets(st.integers(0, count - 1))
     observed = data.draw(st.lists(sets, min_size=1, max_size=30), label="met")
     size = np.array([data.draw(st.integers(1, 9)) for _ in observed])
     episode = np.repeat(np.arange(len(observed)), size)
     member = np.array([[*(s in one for s in range(count)), True] for one in observed])[episode]
-    strata = strata_of_episodes(count)
+    strata = episode_strata(count)
     code = assign(member, strata)
     got = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
     assert len(got) == len(observed)
@@ -82,7 +82,7 @@ def test_every_condition_has_an_episode_of_its_own_if_it_can(data):
         could = [i for i, one in enumerate(observed) if s in one]
         alone = [i for i in could if len(observed[i]) == 1]
         assert set(alone) <= set(np.flatnonzero(got == s).tolist())
-        # It is empty only where its episodes are fewer than the strata that want them.
+        # A stratum is empty only if it has fewer episodes than there are strata that want them.
         if could and not rows[s]:
             rivals = set().union(*(observed[i] for i in could)) - {s}
             assert rivals
@@ -91,13 +91,13 @@ def test_every_condition_has_an_episode_of_its_own_if_it_can(data):
     assert got.tolist() == again.tolist()
 
 
-def test_an_episode_counts_for_the_rarest_of_its_conditions():
+def test_episode_counts_for_its_rarest_condition():
     # Two episodes met both; the second condition was met in eight more.
     observed = [{0, 1}, {0, 1}, *({1} for _ in range(8)), set()]
     episode = np.repeat(np.arange(len(observed)), 10)
     member = np.array([[0 in one, 1 in one, True] for one in observed])[episode]
     for order in ([1, 0], [0, 1]):  # whichever comes first by priority
-        strata = strata_of_episodes(2)
+        strata = episode_strata(2)
         strata = [
             replace(stratum, priority=priority)
             for stratum, priority in zip(strata, [*order, 9], strict=True)
@@ -107,7 +107,7 @@ def test_an_episode_counts_for_the_rarest_of_its_conditions():
         assert given.tolist() == [0, 0, *([1] * 8), NO_STRATUM]
 
 
-def test_by_priority_and_a_priority_of_its_own(transitions):
+def test_priorities_of_episode_strata(transitions):
     each = "[each_condition]\nunit = 'episode'\n" + NO_SPLIT
     rarest = {line.name: line.rows for line in planned(transitions, each).strata}
     listed = NO_SPLIT + by_priority(CONDITIONS)
@@ -122,7 +122,7 @@ def test_by_priority_and_a_priority_of_its_own(transitions):
     assert kept["wheel_slip"] == sum(row["episode_id"] in slipped for row in labels)
 
 
-def test_what_a_stratum_misses_is_what_would_fill_it():
+def test_missing_rows_would_fill_stratum():
     text = "max_replays_per_row = 50\nplanned_draws = 100_000\n" + EVERY
     mixture = parse_mixture(text)
     rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
@@ -132,12 +132,12 @@ def test_what_a_stratum_misses_is_what_would_fill_it():
     assert missing.tolist() == [0, 407]  # 25,000 draws at 50 a row are 500 rows
     filled = plan_shares(mixture, rules, rows + missing, episodes, draws=draws)
     np.testing.assert_allclose(filled.got, filled.wanted)
-    # Without a limit a row is enough.
+    # Without a limit one row is enough.
     free, none = parse_mixture(EVERY), np.array([10_000, 0])
     assert missing_rows(free, none, plan.wanted, draws).tolist() == [0, 1]
 
 
-def test_what_is_missing_counts_the_logging_that_a_mixture_is_of(transitions):
+def test_missing_rows_count_only_admitted_recordings(transitions):
     text = "max_replays_per_row = 40\n[each_condition]\nshare = 'equal'\n" + NO_SPLIT
     recording, *others = pc.unique(transitions["recording_id"]).to_pylist()
     assert others
@@ -149,7 +149,7 @@ def test_what_is_missing_counts_the_logging_that_a_mixture_is_of(transitions):
         assert found.tolist() == of_episodes[~np.isnan(of_episodes)].tolist()
 
 
-def test_the_plan_shows_four_shares_and_what_is_missing(store_path, tmp_path, shell):
+def test_plan_shows_four_shares_and_missing_rows(store_path, tmp_path, shell):
     (tmp_path / "m.toml").write_text(
         "max_replays_per_row = 40\n[each_condition]\nunit = 'episode'\nshare = 'equal'\n"
     )
@@ -160,13 +160,18 @@ def test_the_plan_shows_four_shares_and_what_is_missing(store_path, tmp_path, sh
     for line in short:
         assert line["note"]
     text = shell.out(*arguments)
-    for name in ("natural: %", "wanted: %", "drawn: % of", "% of their"):  # what each is of
+    for name in (
+        "natural: %",
+        "wanted: %",
+        "drawn: % of",
+        "% of their",
+    ):  # their units
         assert name in text
-    assert "% wanted" not in text  # one number of a name: the table's
+    assert "% wanted" not in text  # only the table has this number
     assert f"{short[0]['missing_rows']:,} more rows would fill it" in text
 
 
-def test_an_audit_finds_weights_that_undo_a_quota(store_path, tmp_path):
+def test_audit_finds_weights_that_undo_quota(store_path, tmp_path):
     allow = EQUAL + "[correction]\npost = '{}'\nbelow_natural = 'allow'\n"
     for post, status in (("full", "fail"), ("none", "pass")):
         panel = panel_of(store_path, allow.format(post), tmp_path / post)
@@ -182,7 +187,7 @@ def test_an_audit_finds_weights_that_undo_a_quota(store_path, tmp_path):
     run, name = tmp_path / "run", "effective_share"
     run.mkdir()
     (run / "config.json").write_text("{}")
-    lines = [  # stratum, natural, drawn rows, effective share: twice, an interval each
+    lines = [  # stratum, natural share, drawn rows, effective share; the same in two intervals
         ("nominal", 0.90, 60, 0.62),
         ("wheel_slip", 0.04, 30, 0.01),
         ("recovery", 0.06, 10, 0.37),
@@ -208,7 +213,7 @@ def test_an_audit_finds_weights_that_undo_a_quota(store_path, tmp_path):
     pq.write_table(pa.Table.from_pylist(rows), run / "fed.parquet")
     with open_place(store_path, beside={"run": run}) as connection:
         found = run_audits(connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["run"])
-    starved, row = found[0].sample  # of the batch, then by weights
+    starved, row = found[0].sample  # short in the batch, then reduced by weights
     assert (starved["stratum"], starved["source"], starved["reason"]) == (
         "recovery",
         "batch",

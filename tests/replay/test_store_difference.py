@@ -1,4 +1,4 @@
-"""`restock coverage diff` of stores, versions and panels: what came, went and changed."""
+"""`restock coverage diff` of stores, versions and panels: rows added, removed and changed."""
 
 from datetime import datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from restock.replay.store.store import Store
 
 
 def relabelled(rows: pa.Table, steps: int) -> pa.Table:
-    """Return the same rows of another ingest, the first of them slipping."""
+    """Return the rows with the first `steps` labelled as wheel slip."""
     condition = rows["condition"].to_pylist()
     condition[:steps] = ["wheel_slip"] * steps
     return replaced(rows, {"condition": condition})
@@ -33,7 +33,7 @@ def differences(first: Path, second: Path) -> dict[str, Any]:
         return diff_stores(a, b)
 
 
-def test_what_came_went_and_was_labelled_anew(tmp_path):
+def test_diff_lists_added_removed_relabelled(tmp_path):
     rows = [recording_transitions(number) for number in range(6)]
     first = write_store(tmp_path / "a", rows[:4])
     again = relabelled(recording_transitions(2, ingest="b"), 20)
@@ -63,7 +63,7 @@ def test_what_came_went_and_was_labelled_anew(tmp_path):
     assert {row["of"] for row in found["shares"]} >= {"primary_condition", "zone"}
 
 
-def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path):
+def test_unchanged_reingest_is_no_difference(tmp_path):
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, ingest="b")])
     found = differences(first, second)
@@ -72,7 +72,7 @@ def test_rows_ingested_again_as_they_were_are_no_difference(tmp_path):
     assert all(line["difference"] == 0 for line in found["shares"])
 
 
-def test_rows_that_changed_make_their_episode_another(tmp_path):
+def test_changed_row_marks_episode_as_changed(tmp_path):
     rows, again = recording_transitions(1), recording_transitions(1, ingest="b")
     reward = again["reward"].to_numpy().copy()
     reward[3] += 1
@@ -83,7 +83,7 @@ def test_rows_that_changed_make_their_episode_another(tmp_path):
     assert found["recordings"][0]["episodes_changed"] == 1
 
 
-def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, shell):
+def test_versions_of_store_by_number_and_time(tmp_path, shell):
     writer = StoreWriter(tmp_path / "store")
     for number in (1, 2):
         newest = writer.write(*one(number))
@@ -106,7 +106,7 @@ def test_two_versions_of_a_store_by_number_and_by_time(tmp_path, shell):
         Store(tmp_path / "store", version="newest")  # type: ignore[arg-type]
 
 
-def test_a_version_is_split_unless_a_folder_is_called_so(tmp_path):
+def test_version_suffix_is_split_unless_folder_exists(tmp_path):
     assert split_version("store@12") == ("store", 12)
     assert split_version("s3://bucket/store@2026-11-01T08:00Z")[0] == "s3://bucket/store"
     assert split_version("me@home/store") == ("me@home/store", None)
@@ -114,7 +114,7 @@ def test_a_version_is_split_unless_a_folder_is_called_so(tmp_path):
     assert split_version(f"{tmp_path}/store@12") == (f"{tmp_path}/store@12", None)
 
 
-def test_the_manifest_of_an_empty_store_is_no_task(tmp_path):
+def test_diff_with_empty_store(tmp_path):
     rows = recording_transitions(1)
     empty = write_store(tmp_path / "a", [])
     write_deltalake(str(empty / "recordings"), manifest(rows).slice(0, 0), description=FORMAT)
@@ -128,7 +128,7 @@ def test_the_manifest_of_an_empty_store_is_no_task(tmp_path):
 HALF = "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY + NO_SPLIT
 
 
-def test_rows_shares_and_keys_that_differ(tmp_path, shell):
+def test_panel_diff_lists_rows_shares_and_keys(tmp_path, shell):
     store = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
     panel_of(store, EVERY + NO_SPLIT, tmp_path / "a")
     panel_of(store, "where = \"zone = 'cross'\"\n" + HALF, tmp_path / "b")
@@ -150,7 +150,7 @@ def test_rows_shares_and_keys_that_differ(tmp_path, shell):
     assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "a"), "--exit-code"]) == 0
 
 
-def test_two_tasks_and_two_kinds_of_places_are_refused(tmp_path, shell):
+def test_diff_of_other_task_or_kind_is_refused(tmp_path, shell):
     other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
     first = write_store(tmp_path / "first", [recording_transitions(1)])
     second = write_store(tmp_path / "second", [recording_transitions(1, task=other)], task=other)
@@ -160,12 +160,12 @@ def test_two_tasks_and_two_kinds_of_places_are_refused(tmp_path, shell):
         message = shell.err("coverage", "diff", left, right)
         assert TASK.hash in message
         assert other.hash in message
-    assert "--profile" in message  # of stores: their recordings can be ingested again
+    assert "--profile" in message  # for stores, whose recordings can be ingested again
     assert "is a panel" in shell.err("coverage", "diff", tmp_path / "a", first)
     assert "no such store" in shell.err("coverage", "diff", first, tmp_path / "none")
 
 
-def test_keys_are_compared_below_lists_by_name():
+def test_list_entries_are_compared_by_name():
     a = {"strata": [{"name": "x", "share": 1}], "seed": 1, "same": [1]}
     b = {"strata": [{"name": "y"}, {"name": "x", "share": 2}], "seed": 1, "same": [1]}
     assert key_differences(a, b) == [

@@ -32,7 +32,7 @@ BAGS = [
 
 
 def plain(value: Any) -> Any:
-    """Return a message of rosbags as SQL has it: dicts, lists, and times as nanoseconds."""
+    """Convert a rosbags message to what SQL returns: dicts, lists, and times as nanoseconds."""
     if hasattr(value, "nanosec") and hasattr(value, "sec"):
         return value.sec * 10**9 + value.nanosec
     if dataclasses.is_dataclass(value):
@@ -55,7 +55,7 @@ def read_by_rosbags(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
 
 
 def expect_equal(shell: Shell, path: Path) -> int:
-    """Compare every row of every topic with rosbags; return how many rows that were."""
+    """Compare every row of every topic with rosbags, and return the number of rows."""
     expected: dict[str, list[str]] = {}
     for topic, log_ns, fields in read_by_rosbags(path):
         stamp = fields.get("header", {}).get("stamp")
@@ -77,20 +77,20 @@ def finite(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_values_are_those_that_rosbags_reads(storage, tmp_path, shell):
+def test_values_match_rosbags(storage, tmp_path, shell):
     bag = write_bag(tmp_path / "bag", storage=storage)
     assert expect_equal(shell, bag) == 20 * len(TOPICS)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", BAGS)
-def test_values_of_other_peoples_recordings_are_equal(name, shell):
+def test_values_of_public_recordings_match_rosbags(name, shell):
     if not (SHARED / name).exists():
         pytest.skip("../shared/bags is absent")
     assert expect_equal(shell, SHARED / name)
 
 
-def test_only_topics_that_a_query_names_are_decoded(tmp_path, shell, monkeypatch):
+def test_only_queried_topics_are_decoded(tmp_path, shell, monkeypatch):
     bag, decoded = write_bag(tmp_path / "bag"), []
     batches = Recording.batches
 
@@ -109,14 +109,14 @@ def test_only_topics_that_a_query_names_are_decoded(tmp_path, shell, monkeypatch
     assert sorted(decoded) == ["/odom", "/scan"]
 
 
-def test_a_missing_topic_is_refused_with_the_nearest_names(tmp_path, shell):
+def test_missing_topic_suggests_nearest_names(tmp_path, shell):
     bag = write_bag(tmp_path / "bag")
     err = shell.err("sql", bag, 'FROM "/odm"')
     assert '"/odom"' in err
     assert "FROM columns" in err
 
 
-def test_a_folder_is_a_union_that_names_its_files(tmp_path, shell):
+def test_folder_is_union_with_file_column(tmp_path, shell):
     for name, count in (("a", 3), ("b's", 5)):
         write_bag(tmp_path / name, count=count)
     query = 'SELECT file, count(*) AS n FROM "/odom" GROUP BY ALL ORDER BY n'
@@ -128,10 +128,10 @@ def test_a_folder_is_a_union_that_names_its_files(tmp_path, shell):
     assert shell.json("sql", f"{tmp_path}/a*", query) == [{"file": files[0], "n": 3}]
     query = "SELECT DISTINCT file FROM topics ORDER BY ALL"
     assert [row["file"] for row in shell.json("sql", tmp_path, query)] == files
-    assert "Did you mean" not in shell.err("sql", tmp_path, "FROM stord_odom")  # a table of our own
+    assert "Did you mean" not in shell.err("sql", tmp_path, "FROM stord_odom")  # internal
 
 
-def test_what_is_lost_is_said_and_the_rest_answered(tmp_path, shell):
+def test_lost_data_is_reported_and_rest_returned(tmp_path, shell):
     whole = write_bag(tmp_path / "bag", storage="mcap", count=2000)
     (file,) = whole.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
@@ -160,7 +160,7 @@ def write_json(path: Path, topics: dict[str, list[Any]]) -> Path:
     return path
 
 
-def test_hostile_names_stay_names(tmp_path, shell):
+def test_hostile_names_are_quoted(tmp_path, shell):
     name = """/a"b'; DROP TABLE x; --é \u202e\x1b[2J"""
     fields = {"x": 1.0, "X": 2.0, "": 3.0, "log_time_ns": 4.0, "in": {"y": "-2", "Y": "=1"}}
     topics = {name: [fields], "/Odom": [{"a": 1.0}], "/odom": [{"a": 2.0}], "columns": [{"a": 3.0}]}
@@ -184,14 +184,14 @@ def test_hostile_names_stay_names(tmp_path, shell):
     ]
 
 
-def test_a_topic_that_cannot_be_decoded_is_refused(tmp_path, shell):
+def test_undecodable_topic_is_refused(tmp_path, shell):
     write_channels(
         tmp_path / "a.mcap", ("/own", "cbor", "own_msgs/msg/Own", "ros2msg", b"", [b"x"])
     )
     assert "/own cannot be decoded" in shell.err("sql", tmp_path / "a.mcap", 'FROM "/own"')
 
 
-def test_python_opens_a_recording_a_panel_and_a_store_alike(store_path, tmp_path, capsys):
+def test_open_takes_recording_panel_or_store(store_path, tmp_path, capsys):
     bag = write_bag(tmp_path / "bag")
     panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "panel").path
     for place, shown in ((bag, "/odom"), (panel, "logs"), (store_path, "wheel_slip")):

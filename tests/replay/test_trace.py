@@ -1,4 +1,4 @@
-"""A sampled row leads back to its panel, store, recording and messages, or says what is missing."""
+"""Tracing a sampled row to its panel, store, recording and messages, or to what is missing."""
 
 import hashlib
 import json
@@ -97,7 +97,7 @@ def write_run(path: Path, panel: Panel) -> None:
     )
 
 
-def test_an_audited_row_leads_to_the_messages_it_was_made_of(places):
+def test_audited_row_is_traced_to_its_messages(places):
     found = trace_row(places.run, "7/1", recording=RECORDING)
     assert found.panel is not None
     assert found.panel["row"] == 100
@@ -120,7 +120,7 @@ def test_an_audited_row_leads_to_the_messages_it_was_made_of(places):
     assert held["pose"].fields["pose.pose.position.x"] == pytest.approx(row["pose_x_m"])
     assert held["pose"].stamp_ns == row["pose_stamp_ns"]
     assert held["wheels"].fields["twist.twist.linear.x"] == pytest.approx(row["wheel_speed_mps"])
-    # Nothing that made an observation is from after the tick, or older than the profile allows.
+    # No message in an observation is later than the tick, or older than the profile allows.
     low, high = found.origin.moment["window_ns"]
     assert low < held["scan"].log_time_ns <= high
     for name in held.keys() - {"behaviour_policy", "true_condition"}:
@@ -129,7 +129,7 @@ def test_an_audited_row_leads_to_the_messages_it_was_made_of(places):
     assert {name for topic in found.origin.topics for name in topic["fills"]} >= {"command", "scan"}
 
 
-def test_the_parts_of_a_reward_sum_to_it(places):
+def test_reward_parts_sum_to_reward(places):
     steps = places.rows("FROM transitions ORDER BY transition_id")
     whole = 0
     for row in steps[::80]:
@@ -143,7 +143,7 @@ def test_the_parts_of_a_reward_sum_to_it(places):
     assert whole > 5
 
 
-def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places):
+def test_fresh_row_is_traced_to_seed_of_episode(places):
     found = trace_row(places.run, "7/3")
     assert found.origin is None
     assert found.episode == {
@@ -159,11 +159,11 @@ def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places):
     assert found.audit["episode_step"] == 4
 
 
-def test_audited_rows_are_listed_by_their_error(places):
+def test_audited_rows_are_listed_by_td_error(places):
     assert [row["row"] for row in listed_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
 
 
-def test_a_row_of_the_panel_can_be_followed_too(places):
+def test_panel_row_can_be_traced(places):
     found = trace_row(places.panel, "5")
     assert found.panel is not None
     assert found.origin is not None
@@ -171,7 +171,7 @@ def test_a_row_of_the_panel_can_be_followed_too(places):
     assert trace_row(places.panel, 5) == found
 
 
-def test_rows_that_are_not_there_are_refused(places, tmp_path):
+def test_missing_rows_are_refused(places, tmp_path):
     for place, row, error, problem in (
         (places.run, "12", RunError, "is not an audited row"),
         (places.run, "8/0", RunError, "was not audited"),
@@ -188,7 +188,7 @@ def test_rows_that_are_not_there_are_refused(places, tmp_path):
             trace_row(place, row)
 
 
-def test_places_that_were_moved_are_asked_for_and_taken(places, tmp_path):
+def test_moved_places_are_reported_with_remedy(places, tmp_path):
     store, panel = tmp_path / "store", tmp_path / "panel"
     shutil.copytree(places.store, store)
     panel_of(store, MIXTURE, panel)
@@ -204,7 +204,7 @@ def test_places_that_were_moved_are_asked_for_and_taken(places, tmp_path):
         trace_row(tmp_path / "run", "7/0")
 
 
-def test_a_row_that_was_labelled_again_since_says_so(tmp_path):
+def test_trace_notes_later_relabelling(tmp_path):
     before = recording_transitions(1)
     writer = write_store(tmp_path / "store", [before, recording_transitions(2)])
     panel_of(writer, MIXTURE, tmp_path / "panel")
@@ -222,19 +222,19 @@ def test_a_row_that_was_labelled_again_since_says_so(tmp_path):
 
 
 def replace_recording(store: Path, rows: pa.Table) -> None:
-    """As an ingest does: the recording's old rows go in the commit that brings the new ones."""
+    """Replace a recording's rows in one commit, as an ingest does."""
     write_deltalake(str(store / "recordings"), manifest(rows), mode="append", description=FORMAT)
     table = DeltaTable(str(store / "transitions"))
     predicate = f"recording_id = '{rows['recording_id'][0].as_py()}'"
     write_deltalake(table, rows, mode="overwrite", predicate=predicate)
 
 
-def test_the_verb_prints_a_trace_and_its_document(places, shell):
+def test_trace_verb_prints_text_and_json(places, shell):
     assert "7/2" in shell.out("trace", places.run)
     arguments = ["trace", str(places.run), "7/2", "--recording", str(RECORDING)]
     out = shell.out(*arguments)
-    for said in ("as it was sampled", "its recording", "/cmd_vel", "same_bytes_as_sampled"):
-        assert said in out
+    for text in ("as it was sampled", "its recording", "/cmd_vel", "same_bytes_as_sampled"):
+        assert text in out
     document = shell.json(*arguments)
     assert document["messages"][0]["topic"] == "/cmd_vel"
     assert document["transition"]["recording_id"] == document["recording"]["recording_id"]

@@ -1,4 +1,4 @@
-"""Strata that want a share and have nearly no rows: each is named, with what gives it some."""
+"""Strata with a share and almost no rows are reported, each with a remedy."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from support.shell import Shell
 
 from restock.cli import main
 
-# In all 14 episodes of these logs the wheels lose .25 m/s within a step, in one of them .4.
+# In all 14 episodes of these logs the wheel speed drops by 0.25 m/s in a step, in one by 0.4.
 BRAKING = """
 [[condition]]
 name = "hard_braking"
@@ -26,7 +26,7 @@ LISTED = '[[strata]]\nname = "{}"\nunit = "{}"\nshare = "equal"\n'
 
 @pytest.fixture(scope="module")
 def braking(tmp_path_factory) -> Path:
-    """Return a real recording, labelled by a profile that calls every stop hard braking."""
+    """Return a folder with a store of a real recording, every stop labelled as hard braking."""
     folder = tmp_path_factory.mktemp("braking")
     (folder / "amr.toml").write_text(WAREHOUSE + BRAKING.format(0.25))
     log, store = str(ROOT / "sample_logs" / "amr_tuesday"), str(folder / "store")
@@ -36,7 +36,7 @@ def braking(tmp_path_factory) -> Path:
 
 
 class Mix:
-    """`restock mix --dry-run` of a mixture's text."""
+    """Runs `restock mix --dry-run` with a mixture given as text."""
 
     def __init__(self, folder: Path, shell: Shell) -> None:
         self.file, self.shell = folder / "mine.toml", shell
@@ -58,16 +58,16 @@ def mix(tmp_path: Path, shell: Shell) -> Mix:
     return Mix(tmp_path, shell)
 
 
-def test_a_condition_of_every_episode_leaves_nominal_none(braking, mix):
+def test_condition_in_every_episode_leaves_nominal_empty(braking, mix):
     store = braking / "store"
     strata, (warning,) = mix(store, NOMINAL + EACH)
     assert strata["nominal"]["rows"] == 0
     assert warning.startswith("nominal has no episode: each met the condition of another stratum")
     assert "warning: nominal has no episode" in mix.err(store, NOMINAL + EACH, code=0)
-    # It does not hide behind a refusal.
+    # It is reported in a refusal, too.
     refused = mix.err(store, 'shortfall = "refuse"\n' + NOMINAL + EACH)
     assert "nominal wants 40.0%, and has no episode" in refused
-    # The remedies that it gives fill the shelf.
+    # The suggested remedies fill the stratum.
     for remedy in ('unit = "step"', 'unit = "episode"\nmin_steps = 2'):
         braked = f'[[strata]]\nname = "hard_braking"\nshare = "equal"\n{remedy}\n'
         strata, warnings = mix(store, NOMINAL + braked + EACH)
@@ -75,16 +75,16 @@ def test_a_condition_of_every_episode_leaves_nominal_none(braking, mix):
         assert warnings == []
 
 
-def test_nothing_is_said_of_strata_with_what_they_want(store_path, mix):
+def test_filled_strata_give_no_warning(store_path, mix):
     assert mix(store_path, "[each_condition]\nshare = 'natural'\n")[1] == []
     assert mix(store_path, "[each_condition]\nshare = 'equal'\n")[1] == []
-    # Without a wanted share an empty stratum is no mistake.
+    # An empty stratum without a wanted share is no mistake.
     never = '[[strata]]\nname = "never"\nwhere = "false"\nshare = {}\n[each_condition]\n'
     assert mix(store_path, never.format(0.0))[1] == []
     assert mix(store_path, never.format('"natural"'))[1] == []
 
 
-def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
+def test_quota_without_logged_rows_is_reported(braking, mix):
     store = braking / "store"
     where = "where = \"NOT list_contains(conditions, 'wheel_slip')\"\n"
     strata, warnings = mix(store, where + "[each_condition]\nshare = 'equal'\n")
@@ -104,7 +104,7 @@ def test_a_quota_for_what_the_logs_lack_is_named(braking, mix):
     assert "or give it a `where`; or add it to the profile and run `restock store label`" in unknown
 
 
-def test_quotas_that_no_shelf_can_fill_are_each_named(store_path, mix):
+def test_unfillable_quotas_are_each_reported(store_path, mix):
     names = ("nominal", "recovery", "near_collision", "wheel_slip", "blocked_aisle")
     limit = "shortfall = 'refuse'\nmax_replays_per_row = 3\n[each_condition]\nshare = 'equal'\n"
     refused = mix.err(store_path, limit)

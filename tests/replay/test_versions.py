@@ -1,4 +1,4 @@
-"""Time travel: every verb that reads a store answers as it was at a version or a time."""
+"""Time travel: verbs read a store as it was at a version or a time."""
 
 import json
 from pathlib import Path
@@ -25,32 +25,32 @@ def versions(tmp_path_factory) -> tuple[Path, int]:
     return path, first
 
 
-def test_each_reads_what_was(versions, tmp_path, capsys):
+def test_verbs_read_older_version(versions, tmp_path, capsys):
     path, first = versions
     store = f"{path}@{first}"
     rows = one(1)[1]
 
-    def requested(*args: str) -> object:
+    def run_json(*args: str) -> object:
         assert main([*args, "--json"]) in (0, 1)
         return json.loads(capsys.readouterr().out)
 
-    assert requested("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
-    plan = requested("mix", store, "--mixture", "uniform", "--dry-run")
+    assert run_json("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
+    plan = run_json("mix", store, "--mixture", "uniform", "--dry-run")
     assert isinstance(plan, dict)
     assert plan["store_version"] == first
-    gaps = requested("coverage", "gaps", store, "--mixture", "uniform")
+    gaps = run_json("coverage", "gaps", store, "--mixture", "uniform")
     assert isinstance(gaps, dict)
     assert (gaps["store_version"], gaps["episodes"]) == (first, 12)
     out = tmp_path / "rows.parquet"
-    requested("export", store, "--to", "parquet", "--out", str(out))
+    run_json("export", store, "--to", "parquet", "--out", str(out))
     assert pq.read_metadata(out).num_rows <= len(rows)
     identity = rows["transition_id"][0].as_py()
-    found = requested("trace", store, str(identity))
+    found = run_json("trace", store, str(identity))
     assert isinstance(found, dict)
     assert found["store"]["version"] == first
-    shelves = requested("coverage", store)
-    assert isinstance(shelves, list)
-    assert requested("audit", store)
+    coverage = run_json("coverage", store)
+    assert isinstance(coverage, list)
+    assert run_json("audit", store)
     with restock.open(store) as opened:
         assert opened.version == first
     with restock.open(str(path), version=first) as opened:
@@ -59,11 +59,11 @@ def test_each_reads_what_was(versions, tmp_path, capsys):
         assert opened.version == first + 1
 
 
-def test_what_has_no_versions_says_so(versions, tmp_path, shell):
+def test_version_is_refused_where_unsupported(versions, tmp_path, shell):
     path, first = versions
     assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
     panel, out = f"{tmp_path / 'panel'}@1", str(tmp_path / "x.parquet")
-    for args, said in (
+    for args, problem in (
         (["sql", panel, "FROM rows"], "only a store has versions"),
         (["export", panel, "--to", "parquet", "--out", out], "is a panel, not a store"),
         (["store", "label", f"{path}@{first}"], "only the newest version can be changed"),
@@ -73,12 +73,12 @@ def test_what_has_no_versions_says_so(versions, tmp_path, shell):
         (["sql", f"{path}@2026-13-01", "FROM recordings"], "neither the number of a version"),
         (["sql", f"{path}x@{first}", "FROM recordings"], "restock ingest"),
     ):
-        assert said in shell.err(*args)
+        assert problem in shell.err(*args)
     with pytest.raises(StoreError, match="neither the number"):
         restock.open(str(path), version="yesterday")
 
 
-def test_a_version_whose_files_are_gone_names_the_retention(tmp_path):
+def test_removed_version_reports_retention(tmp_path):
     writer = StoreWriter(tmp_path / "store")
     first = writer.write(*one(1))
     writer.write(*one(1, ingest="b"))
@@ -89,13 +89,13 @@ def test_a_version_whose_files_are_gone_names_the_retention(tmp_path):
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_version_of_joined_files_is_gone_as_one_of_one_file(tmp_path, version):
+def test_removed_version_of_compacted_store(tmp_path, version):
     writer = StoreWriter(tmp_path / "store")
     writer.write_all([one(1), one(2)])
     compact(writer)
     writer.write(*one(1, "b"))
     writer.clean(retention_hours=0)
     _read.cache_clear()  # as in another process
-    with pytest.raises(StoreError, match=f"its version {version} can no longer be read") as said:
+    with pytest.raises(StoreError, match=f"its version {version} can no longer be read") as error:
         Store(tmp_path / "store", version=version)
-    assert "7 days" in str(said.value)
+    assert "7 days" in str(error.value)
