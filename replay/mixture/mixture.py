@@ -82,13 +82,13 @@ class SourceShares(Checked, frozen=True):
         return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
 
     @property
-    def said(self) -> dict[str, Represents | None]:
+    def represented(self) -> dict[str, Represents | None]:
         """Return `represents` of each source except fresh rows; None if the mixture omits it."""
         return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
 
     def chosen(self, name: str) -> bool:
         """Return whether the mixture gives a source other rates than those of its own rows."""
-        return self.said[name] not in (None, "natural")
+        return self.represented[name] not in (None, "natural")
 
 
 def _check_rates(represents: Represents | None) -> None:
@@ -188,9 +188,9 @@ class StratumRule(StratumLimits, frozen=True, kw_only=True):
         super().check()
         _require(bool(self.name), "name is empty: a stratum needs a name")
         if isinstance(share := self.share, int | float):
-            said = f"share of {self.name!r} is {share:g}"
-            _require(share >= self.floor, f"{said}, below its floor of {self.floor:g}")
-            _require(share <= self.cap, f"{said}, above its cap of {self.cap:g}")
+            problem = f"share of {self.name!r} is {share:g}"
+            _require(share >= self.floor, f"{problem}, below its floor of {self.floor:g}")
+            _require(share <= self.cap, f"{problem}, above its cap of {self.cap:g}")
 
 
 class EachCondition(StratumLimits, frozen=True, kw_only=True):

@@ -33,8 +33,8 @@ from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # online batches between two updates of the shares
-_SAME = 0.01  # relative change of a share below which shares are kept
-_SHORT = 1e-3  # share of all rows fed below which a shortfall counts as rounding
+_MIN_CHANGE = 0.01  # relative change of a share below which shares are kept
+_MIN_SHORTFALL = 1e-3  # share of all rows fed below which a shortfall counts as rounding
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class ShareController(Stateful):
         self.max_replays = mixture.most_draws  # largest number of draws of one row; None: no limit
         self.fresh, self.online = fresh, False
         size = len(strata) // len(mixture.sources.parts)
-        self._of: Ints = np.arange(len(strata)) % size  # index of each entry's stratum, 0..S - 1
+        self._index: Ints = np.arange(len(strata)) % size  # index of each entry's stratum, 0..S - 1
         self.wanted: F64 = np.zeros(size)
         self.fresh_shares: F64 = np.append(np.zeros(size), 1.0)
         self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in units of a batch
@@ -131,8 +131,8 @@ class ShareController(Stateful):
         self.sources = [self._source(name) for name in self.parts]
         shares = [stratum.rule.share for stratum in strata]
         # If no stratum has a quota, the ring is sampled uniformly.
-        self._steers = any(share != "natural" for share in shares)
-        self._work_out(mixture.shortfall)
+        self._has_quotas = any(share != "natural" for share in shares)
+        self._compute_shares(mixture.shortfall)
         self.planned_shares, self._wanted_offline = self.shares.copy(), self.wanted
         if fresh is not None and mixture.shortfall == "refuse":
             self._refuse_short()
@@ -187,12 +187,12 @@ class ShareController(Stateful):
         self.online = True
         if stock is not None:
             self.stock = stock
-        return self._work_out("redistribute")
+        return self._compute_shares("redistribute")
 
     def replan(self, planned: PlannedDraws) -> bool:
         """Plan for other draws from the next batch on; return whether the shares changed."""
         self._plan_for(planned)
-        return self._work_out("redistribute")
+        return self._compute_shares("redistribute")
 
     def _plan_for(self, planned: PlannedDraws) -> None:
         self.planned = planned
@@ -206,12 +206,12 @@ class ShareController(Stateful):
 
     def give_up(self) -> bool:
         """Redistribute shares after a stratum used up its draws; return whether they changed."""
-        return self._work_out("redistribute")
+        return self._compute_shares("redistribute")
 
-    def _work_out(self, shortfall: Shortfall) -> bool:
+    def _compute_shares(self, shortfall: Shortfall) -> bool:
         """Compute the current shares within the draws left; return whether they changed."""
         if self.online:
-            return self._beside_ring()
+            return self._compute_online_shares()
         if self.mixture.shortfall == "shrink" and self.fresh is None:
             shortfall = "shrink"
         shares, logs_share = np.zeros(len(self.strata)), 0.0
@@ -222,7 +222,9 @@ class ShareController(Stateful):
             logs_share += self.parts[source.name] * online_filled
         total = shares.sum()
         shares = shares / total if total > 0 else self.shares
-        self.wanted = np.bincount(self._of, self._requested) / max(sum(self.parts.values()), 1e-12)
+        self.wanted = np.bincount(self._index, self._requested) / max(
+            sum(self.parts.values()), 1e-12
+        )
         changed = logs_share != self.logs_share or not np.array_equal(shares, self.shares)
         self.shares, self.logs_share = shares, logs_share
         return changed
@@ -232,7 +234,7 @@ class ShareController(Stateful):
         """Return the shares of an online batch that the mixture wants from the logs, (K * S,)."""
         return np.concatenate([self.parts[source.name] * source.wanted for source in self.sources])
 
-    def _beside_ring(self) -> bool:
+    def _compute_online_shares(self) -> bool:
         """Compute shares of logged and fresh rows in an online batch; return if they changed."""
         logs, fresh, wanted = self._split(self.stock, self._limits())
         self.wanted = wanted
@@ -241,7 +243,7 @@ class ShareController(Stateful):
         before = self.shares * self.logs_share
         # Ignore small changes: after each change, batches drawn ahead must be drawn again.
         same = np.abs(np.append(logs, fresh_shares) - np.append(before, self.fresh_shares))
-        if (same < _SAME * np.append(logs, fresh_shares) + 1e-9).all():
+        if (same < _MIN_CHANGE * np.append(logs, fresh_shares) + 1e-9).all():
             return False
         self.shares = logs / logs_share if logs_share > 0 else self.shares
         self.logs_share, self.fresh_shares = logs_share, fresh_shares
@@ -253,20 +255,20 @@ class ShareController(Stateful):
         `stock` (S,) limits the shares from the ring, `limit` (K * S,) those from the logs.
         """
         requested, logged = self._requested, sum(self.parts.values())
-        wanted = np.bincount(self._of, requested) + max(1.0 - logged, 0.0) * self._wanted_fresh(
+        wanted = np.bincount(self._index, requested) + max(1.0 - logged, 0.0) * self._wanted_fresh(
             stock
         )
         logs = np.minimum(requested, limit)
-        if not self._steers:
+        if not self._has_quotas:
             return logs, np.zeros(len(wanted)), wanted
-        rest = np.maximum(wanted - np.bincount(self._of, logs), 0.0)
+        rest = np.maximum(wanted - np.bincount(self._index, logs), 0.0)
         fresh = np.minimum(rest * self.boosted, stock)
         # Logged rows that may be drawn more often replace missing fresh rows.
         room = limit - logs
-        of_stratum = np.bincount(self._of, room)
+        of_stratum = np.bincount(self._index, room)
         lack = np.minimum(rest - fresh, of_stratum)
         part = np.divide(lack, of_stratum, out=np.zeros(len(lack)), where=of_stratum > 0)
-        return logs + room * part[self._of], fresh, wanted
+        return logs + room * part[self._index], fresh, wanted
 
     @property
     def natural(self) -> F64:
@@ -322,13 +324,13 @@ class ShareController(Stateful):
         planned, size = self.planned, len(self.wanted)
         online = planned.online if self.fresh is not None else 0.0
         total = max(planned.offline + online, 1e-12)
-        logs = planned.offline / total * np.bincount(self._of, self.planned_shares)
+        logs = planned.offline / total * np.bincount(self._index, self.planned_shares)
         wanted, fresh = planned.offline / total * self._wanted_offline, np.zeros(size)
         if online:
             limits = self._limits(from_start=True)
             of_logs, of_ring, requested = self._split(np.full(size, np.inf), limits)
-            by_stratum = np.bincount(self._of, of_logs)
-            if not self._steers:  # the ring is sampled uniformly and gives what logs do not
+            by_stratum = np.bincount(self._index, of_logs)
+            if not self._has_quotas:  # the ring is sampled uniformly and gives what logs do not
                 of_ring = np.maximum(requested - by_stratum, 0.0)
             part = online / total
             logs, fresh, wanted = (
@@ -354,7 +356,7 @@ class ShareController(Stateful):
 
     def why_short(self, stratum: int) -> str:
         """Explain why a stratum gets less of a batch than its quota."""
-        rows = sum(of.rows for of, i in zip(self.strata, self._of, strict=True) if i == stratum)
+        rows = sum(of.rows for of, i in zip(self.strata, self._index, strict=True) if i == stratum)
         limit = self.max_replays
         reason = "the logs have no rows of it"
         if rows:
@@ -372,7 +374,7 @@ class ShareController(Stateful):
 
     def _refuse_short(self) -> None:
         """Raise MixtureError if a quota cannot be met."""
-        short = [row for row in self.forecast() if row["short_share"] > _SHORT]
+        short = [row for row in self.forecast() if row["short_share"] > _MIN_SHORTFALL]
         if short:
             raise MixtureError(
                 "; ".join(

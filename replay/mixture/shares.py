@@ -70,12 +70,12 @@ def represented_shares(
     rows = [np.bincount(source.code, minlength=len(names)) for source in sources]
     own: list[F64] = [source.admitted / max(int(source.admitted.sum()), 1) for source in sources]
     shares: list[F64 | None] = []
-    for number, (source, said) in enumerate(
-        zip(sources, mixture.sources.said.values(), strict=True)
+    for number, (source, stated) in enumerate(
+        zip(sources, mixture.sources.represented.values(), strict=True)
     ):
-        if isinstance(said, Mapping):
-            own[number] = _told(said, names, source.admitted, source.name)
-        elif said == "archive":
+        if isinstance(stated, Mapping):
+            own[number] = _given_rates(stated, names, source.admitted, source.name)
+        elif stated == "archive":
             own[number] = own[0]
         capped = bool((source.admitted > rows[number]).any())
         shares.append(own[number] if capped or mixture.sources.chosen(source.name) else None)
@@ -91,7 +91,7 @@ def stands_for_others(mixture: Mixture, source: str) -> bool:
     return mixture.sources.chosen(source) or capped is not None
 
 
-def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
+def _given_rates(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
     """Return natural shares (S,): the given rates, and the rest divided by the others' rows."""
     if unknown := sorted(set(rates) - set(names)):
         raise MixtureError(
@@ -115,20 +115,20 @@ def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: 
     """Raise MixtureError if a stratum has rows and natural rate 0, which no weights can restore."""
     if all(stratum.correction == "none" for stratum in strata):
         return
-    untold = [
+    unrated = [
         s.rule.name for s, part, n in zip(strata, share, rows, strict=True) if n and part <= 0
     ]
-    if untold:
+    if unrated:
         raise MixtureError(
-            f"source {source!r} has rows of {', '.join(untold)}, but by its `represents`"
+            f"source {source!r} has rows of {', '.join(unrated)}, but by its `represents`"
             " they never occur",
-            remedy=f"give their rates: represents = {{ {untold[0]} = 0.001 }}; or do not weight"
+            remedy=f"give their rates: represents = {{ {unrated[0]} = 0.001 }}; or do not weight"
             ' strata: [correction] pre and post = "none"',
         )
 
 
 def look_for_archives(
-    said: Mapping[str, Represents | None],
+    stated: Mapping[str, Represents | None],
     observed: Mapping[str, Sequence[tuple[int, int]]],
     strata: Collection[str],
 ) -> tuple[str, ...]:
@@ -138,7 +138,7 @@ def look_for_archives(
     `represents`, and compares each with the others that represent their own rates.
 
     Args:
-        said: `represents` of each source.
+        stated: `represents` of each source.
         observed: condition or exposure -> for each source, episodes that met it, and all episodes.
         strata: names of the strata; only their rates affect a panel.
 
@@ -146,9 +146,9 @@ def look_for_archives(
         MixtureError: the condition is a stratum and its odds ratio is ARCHIVE_ODDS or more.
     """
     found = []
-    for number, (source, represents) in enumerate(said.items()):
+    for number, (source, represents) in enumerate(stated.items()):
         others = [
-            k for k, what in enumerate(said.values()) if k != number and what in (None, "natural")
+            k for k, what in enumerate(stated.values()) if k != number and what in (None, "natural")
         ]
         if represents is not None or not others:
             continue
@@ -228,24 +228,24 @@ def plan_shares(
     """
     wanted = wanted_shares(rules, rows if natural is None else natural)
     limit = row_limits(mixture, rows, draws)
-    untold, too_few = unknown or {}, lacking or {}
+    unknown, lacking = unknown or {}, lacking or {}
     caps = np.array([rule.cap for rule in rules])
 
     def complaints() -> str:
         lines = []
         for i, rule in enumerate(rules):
             why = f"its {rows[i]:,} rows in {episodes[i]:,} episodes allow {limit[i]:.2%}"
-            if rule.name in untold:
-                why = f"and is unknown in every row: {untold[rule.name]}"
-            elif rule.name in too_few:
-                why = f"and {too_few[rule.name]}"
+            if rule.name in unknown:
+                why = f"and is unknown in every row: {unknown[rule.name]}"
+            elif rule.name in lacking:
+                why = f"and {lacking[rule.name]}"
             if wanted[i] > limit[i] + 1e-12:
                 lines.append(f"{rule.name} wants {wanted[i]:.1%}, {why}")
         return "\n  ".join(lines)
 
     shares = within_limits(wanted, limit, caps, mixture.shortfall, complaints)
     notes = [
-        f"unknown: {untold[rule.name]}" if rule.name in untold else note
+        f"unknown: {unknown[rule.name]}" if rule.name in unknown else note
         for rule, note in zip(rules, shares.notes, strict=True)
     ]
     return replace(shares, notes=tuple(notes))

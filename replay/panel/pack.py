@@ -40,7 +40,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import FileRecord
-from restock.replay.plan.candidates import Places, any_order, as_stored, codes, matrix, stretches
+from restock.replay.plan.candidates import Places, any_order, codes, matrix, stored_view, stretches
 from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import row_columns, row_width
@@ -300,7 +300,7 @@ class Packer:
         Raises PanelError if an observation or reward is not finite, or an observation has another
         size.
         """
-        of_task = f"FROM {as_stored(self.connection)} WHERE task_hash = '{self.plan.task_hash}'"
+        of_task = f"FROM {stored_view(self.connection)} WHERE task_hash = '{self.plan.task_hash}'"
         first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
         size = int(first[0][0])
         at_a_time = max(BATCH_BYTES // (8 * size), 1)

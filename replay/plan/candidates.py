@@ -46,7 +46,7 @@ class Places:
         self._ids = ids[self._order]
 
     @property
-    def twice(self) -> int:
+    def repeats(self) -> int:
         """Count the ids that repeat an earlier one."""
         return int((self._ids[1:] == self._ids[:-1]).sum())
 
@@ -58,7 +58,7 @@ class Places:
 
 KEYS = ("episode_index", "step_index", "transition_id")  # sort keys after the recording
 COLUMNS_AT_A_TIME = 2  # sorted in parallel; a limit on memory
-_LOOKED_AT = 1 << 20  # codes per block when searching first appearances
+_CODES_AT_A_TIME = 1 << 20  # codes per block when searching first appearances
 
 
 def rows_in_order(
@@ -78,7 +78,7 @@ def rows_in_order(
     for batch in batches:
         for name, values in zip(batch.schema.names, batch.columns, strict=True):
             if (known := texts.get(name)) is not None:
-                parts[name].append(_encoded(values, known))
+                parts[name].append(_encode(values, known))
             else:  # a copy: one column of DuckDB's batch would keep the whole batch in memory
                 parts[name].append(pa.concat_arrays([values, values[:0]]))
 
@@ -98,7 +98,7 @@ def rows_in_order(
     def column(name: str) -> pa.Array:
         in_order, known = whole(name).take(order), texts.get(name)
         del parts[name]
-        return in_order if known is None else _by_appearance(in_order, list(known))
+        return in_order if known is None else _renumber(in_order, list(known))
 
     names = [name for name in schema.names if name not in dropped]
     with ThreadPoolExecutor(COLUMNS_AT_A_TIME, "restock-columns") as pool:
@@ -110,7 +110,7 @@ def _code_type(size: int) -> pa.DataType:
     return pa.int8() if size <= 1 << 7 else pa.int16() if size <= 1 << 15 else pa.int32()
 
 
-def _encoded(column: pa.Array, known: dict[str, int]) -> pa.Array:
+def _encode(column: pa.Array, known: dict[str, int]) -> pa.Array:
     """Dictionary-encode text with `known`, adding new values to it."""
     local = column.cast(pa.string()).dictionary_encode()
     codes = pa.array(
@@ -120,7 +120,7 @@ def _encoded(column: pa.Array, known: dict[str, int]) -> pa.Array:
     return codes.take(local.indices)
 
 
-def _by_appearance(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
+def _renumber(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
     """Renumber codes of `names` in order of first appearance.
 
     The result then does not depend on which thread read its rows first.
@@ -128,8 +128,8 @@ def _by_appearance(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
     wide = codes.cast(pa.int32()).fill_null(len(names)) if codes.null_count else codes
     code = wide.to_numpy()
     first = np.full(len(names) + 1, len(code), np.int64)  # the last entry is for null
-    for begin in reversed(range(0, len(code), _LOOKED_AT)):
-        some = code[begin : begin + _LOOKED_AT]
+    for begin in reversed(range(0, len(code), _CODES_AT_A_TIME)):
+        some = code[begin : begin + _CODES_AT_A_TIME]
         first[some[::-1]] = np.arange(begin + len(some) - 1, begin - 1, -1)
     order = np.argsort(first[: len(names)], kind="stable")
     dictionary = pa.array(names, pa.string()).take(pa.array(order))
@@ -230,12 +230,12 @@ def read_candidates(
     except duckdb.Error as error:
         if damaged := damage(error):
             raise damaged from error
-        _blame(connection, source, predicates)
+        _raise_failing_predicate(connection, source, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
     return rows
 
 
-def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
+def stored_view(connection: duckdb.DuckDBPyConnection) -> str:
     """Return the cheapest table or view that contains the rows of `transitions`."""
     views = connection.sql(_VIEWS).fetchall()
     return "stored_transitions" if ("stored_transitions",) in views else "transitions"
@@ -251,7 +251,7 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
         connection.execute("RESET preserve_insertion_order")
 
 
-def _blame(
+def _raise_failing_predicate(
     connection: duckdb.DuckDBPyConnection, source: str, predicates: dict[str, tuple[str, str]]
 ) -> None:
     """Run each predicate by itself over all rows, and raise ConfigError for one that fails."""
@@ -381,7 +381,7 @@ def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
     return rows
 
 
-def one_task(table: pa.Table) -> str:
+def find_task_hash(table: pa.Table) -> str:
     """Return the one task hash of all rows that the mixture admits.
 
     Raises:

@@ -79,14 +79,14 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
     out.admitted = ~out.gone
     out.add("evaluation split", split.held)
     out.add("gap before the evaluation split", split.gap)
-    bare = ~bools(table, "labelled") & ~out.gone
-    if bare.any() and mixture.unlabelled == "refuse":
+    no_label = ~bools(table, "labelled") & ~out.gone
+    if no_label.any() and mixture.unlabelled == "refuse":
         raise MixtureError(
-            f"{int(bare.sum())} rows have no coverage label: their condition is unknown",
+            f"{int(no_label.sum())} rows have no coverage label: their condition is unknown",
             remedy='`restock store label` the store, or set unlabelled = "drop" (or "nominal")',
         )
     if mixture.unlabelled == "drop":
-        out.add("without a coverage label", bare)
+        out.add("without a coverage label", no_label)
     if mixture.uncertain == "drop":
         out.add("with an uncertain condition", bools(table, "uncertain"))
     return out
@@ -131,8 +131,8 @@ def repeats_of(
         place = places.of(ids)  # -1 if the row is not a candidate
         return np.asarray((place >= 0) & evaluation_split[place], np.bool_)
 
-    shown = np.union1d(original[held(copy)], original[held(original)])
-    same = places.of(np.concatenate([shown, copy[np.isin(original, shown)]]))
+    originals = np.union1d(original[held(copy)], original[held(original)])
+    same = places.of(np.concatenate([originals, copy[np.isin(original, originals)]]))
     repeated[same[same >= 0]] = True
     repeated &= ~evaluation_split
     episode = codes(table, "episode_id")
@@ -243,14 +243,14 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     episode = codes(table, "episode_id")
     admitted = np.isin(episode, np.unique(episode[bools(table, "admitted")]))
     if admitted.all():
-        return _split(table, mixture)
-    split = _split(table.filter(pa.array(admitted)), mixture)
+        return _choose_rows(table, mixture)
+    split = _choose_rows(table.filter(pa.array(admitted)), mixture)
     held, gap = np.zeros(len(table), np.bool_), np.zeros(len(table), np.bool_)
     held[admitted], gap[admitted] = split.held, split.gap
     return EvaluationRows(held, gap, split.by, split.note, split.warning)
 
 
-def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
+def _choose_rows(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     """Choose rows as `split_for_evaluation` does, for a table without episodes to ignore."""
     rule, seed = mixture.evaluation_split, mixture.seed
     if rule.is_empty:
@@ -323,11 +323,11 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
     """Return the rows (N,) of the whole groups that are held out."""
     column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
-    untold = (code < 0) & bools(table, "admitted")
-    if untold.any():
-        of = len(np.unique(codes(table, "recording_id")[untold]))
+    without_tag = (code < 0) & bools(table, "admitted")
+    if without_tag.any():
+        of = len(np.unique(codes(table, "recording_id")[without_tag]))
         raise MixtureError(
-            f"{int(untold.sum()):,} rows of {counted(of, 'recording')} have no {column}: "
+            f"{int(without_tag.sum()):,} rows of {counted(of, 'recording')} have no {column}: "
             "they could belong "
             "to one that is held out",
             remedy=f"add it with `restock ingest RECORDING --tag {column}=…`, or leave them out:"
@@ -336,13 +336,13 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
     names = table[column].combine_chunks().dictionary.to_pylist()
     rows = np.bincount(code[code >= 0], minlength=len(names))
     if rule.robots:
-        there = sorted(name for name, count in zip(names, rows.tolist(), strict=True) if count)
-        if absent := sorted(set(rule.robots) - set(there)):
+        present = sorted(name for name, count in zip(names, rows.tolist(), strict=True) if count)
+        if absent := sorted(set(rule.robots) - set(present)):
             raise MixtureError(
                 f"evaluation_split.robots: the mixture admits no rows of {', '.join(absent)}",
-                remedy=f"the robots are {', '.join(there)}",
+                remedy=f"the robots are {', '.join(present)}",
             )
-        if set(there) == set(rule.robots):
+        if set(present) == set(rule.robots):
             raise MixtureError(
                 "evaluation_split.robots names every robot: nothing would be left to learn from",
                 remedy="name some of them",

@@ -33,7 +33,7 @@ from restock.replay.plan.candidates import (
     bools,
     codes,
     episodes_met,
-    one_task,
+    find_task_hash,
     read_candidates,
     stretches,
     uncertain_labels,
@@ -58,10 +58,10 @@ from restock.replay.plan.strata import (
     NO_STRATUM,
     ResolvedStratum,
     Stratum,
-    as_dealt,
     assign,
     deal_episodes,
-    least_steps,
+    replace_dealt,
+    required_steps,
     resolve_strata,
 )
 from restock.replay.plan.weights import RatioFit
@@ -107,7 +107,7 @@ def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> It
             for wanted in mixture.sources.stores
         ]
         connection = opened.enter_context(duckdb.connect())
-        repeated_rows = _attach(connection, first, others)
+        repeated_rows = _create_views(connection, first, others)
         pinned = tuple(
             PinnedStore(wanted.name, str(store.path), store.version, repeated)
             for (wanted, store), repeated in zip(others, repeated_rows, strict=True)
@@ -133,7 +133,7 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
         ) from error
 
 
-def _attach(
+def _create_views(
     connection: duckdb.DuckDBPyConnection, first: Store, others: Sequence[tuple[OtherStore, Store]]
 ) -> list[int]:
     """Create the views; return how many rows of each other store are also in an earlier store."""
@@ -241,16 +241,16 @@ def plan_panel(
     measured = 0
     if not mixture.odometry_as_command:
         table, measured = without_measured_actions(connection, table)
-    task_hash = one_task(table)
+    task_hash = find_task_hash(table)
     with repeats_installed(connection, mixture):  # reads manifests in a thread meanwhile
         places = Places(table["transition_id"].to_numpy())
-        if twice := places.twice:
+        if repeats := places.repeats:
             raise StoreError(
-                f"{twice} transition ids occur twice",
+                f"{repeats} transition ids occur twice",
                 remedy="`restock audit` names them; ingest those recordings again",
             )
-        member = _members(table, strata)
-        state = _members(table, strata, of_state=True)
+        member = _find_members(table, strata)
+        state = _find_members(table, strata, of_state=True)
         if mixture.unlabelled == "nominal":
             for index, named in enumerate(strata):
                 if named.name == NOMINAL and named.rule.where is None:
@@ -271,7 +271,7 @@ def plan_panel(
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
-    stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
+    stratum, state_code = _deal_by_store(table, strata, member, stratum, state_code, ~out.gone)
     warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
     del member
     beyond_cap = leave_out_of_strata(table, mixture, stratum, out)
@@ -281,36 +281,38 @@ def plan_panel(
             f"no row is left: {reasons}", remedy="correct what leaves out too much in the mixture"
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
-    given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))
+    sources = _collect_sources(
+        mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata)
+    )
     names = [named.name for named in strata]
     warnings += uncertain_labels(connection, names)
     if others:
         observed = episodes_met(connection, mixture, conditions)
-        warnings += look_for_archives(mixture.sources.said, observed, names)
-    occurs = represented_shares(mixture, strata, given)
+        warnings += look_for_archives(mixture.sources.represented, observed, names)
+    occurs = represented_shares(mixture, strata, sources)
     unknown = unknown_conditions(connection)
-    worked_out = [
+    plans = [
         plan_source(connection, mixture, strata, source, natural, unknown)
-        for source, natural in zip(given, occurs, strict=True)
+        for source, natural in zip(sources, occurs, strict=True)
     ]
-    for source, plan in zip(given, worked_out, strict=True):
+    for source, plan in zip(sources, plans, strict=True):
         warnings += tuple(f"{_prefix(source)}{text}" for text in plan.warnings)
-    return _joined(
+    return _merge_sources(
         mixture,
         strata,
         table,
         task_hash,
         split,
         out,
-        given,
-        worked_out,
+        sources,
+        plans,
         others,
         as_of_ns,
         warnings,
     )
 
 
-def _members(
+def _find_members(
     table: pa.Table, strata: Sequence[ResolvedStratum], *, of_state: bool = False
 ) -> Bools:
     """Return the rows that may be in each stratum, (N, S), by its predicate and unit.
@@ -324,12 +326,12 @@ def _members(
         holds = bools(table, f"state_{index}" if own_state else f"stratum_{index}")
         if stratum.steps_of_episode:
             steps = np.bincount(episode[holds], minlength=int(episode.max()) + 1)
-            holds = (steps >= least_steps(stratum.rule, steps))[episode]
+            holds = (steps >= required_steps(stratum.rule, steps))[episode]
         member[:, index] = holds
     return member
 
 
-def _dealt(
+def _deal_by_store(
     table: pa.Table,
     strata: Sequence[ResolvedStratum],
     member: Bools,
@@ -343,13 +345,13 @@ def _dealt(
     numbers = pc.unique(table["store"]).to_pylist()
     for number in numbers:
         at = np.flatnonzero(store == number) if len(numbers) > 1 else slice(None)  # no copies
-        given = deal_episodes(stratum[at], member[at], episode[at], strata, counted[at])
-        stratum[at] = as_dealt(stratum[at], given, episode[at], strata)
-        state_code[at] = as_dealt(state_code[at], given, episode[at], strata)
+        dealt = deal_episodes(stratum[at], member[at], episode[at], strata, counted[at])
+        stratum[at] = replace_dealt(stratum[at], dealt, episode[at], strata)
+        state_code[at] = replace_dealt(state_code[at], dealt, episode[at], strata)
     return stratum, state_code
 
 
-def _sources(
+def _collect_sources(
     mixture: Mixture,
     table: pa.Table,
     stratum: NDArray[np.int16],
@@ -388,15 +390,15 @@ def _sources(
     return sources
 
 
-def _joined(
+def _merge_sources(
     mixture: Mixture,
     strata: Sequence[ResolvedStratum],
     table: pa.Table,
     task_hash: str,
     split: EvaluationRows,
     out: LeftOut,
-    given: Sequence[SourceRows],
-    worked_out: Sequence[SourcePlan],
+    sources: Sequence[SourceRows],
+    plans: Sequence[SourcePlan],
     others: Sequence[PinnedStore],
     as_of_ns: int,
     warnings: tuple[str, ...],
@@ -407,12 +409,12 @@ def _joined(
     state = np.full(len(table), NO_STRATUM, np.int16)
     weight = np.zeros(len(table), np.float32)
     outcome: dict[str, F32] = {}
-    filled = np.array([s.part * p.drawn for s, p in zip(given, worked_out, strict=True)])
+    filled = np.array([s.part * p.drawn for s, p in zip(sources, plans, strict=True)])
     part_of_logs = filled / filled.sum()
     lines: list[Stratum] = []
     found: dict[str, F64] = {}
     never = 0
-    for number, (source, plan) in enumerate(zip(given, worked_out, strict=True)):
+    for number, (source, plan) in enumerate(zip(sources, plans, strict=True)):
         at = source.at[plan.kept]
         never += len(source.at) - len(at)
         code[at] = source.code[plan.kept] + number * size
@@ -457,14 +459,14 @@ def _joined(
         strata=tuple(lines),
         found=found,
         logs_share=float(filled.sum()),
-        logs_share_wanted=sum(source.part for source in given),
+        logs_share_wanted=sum(source.part for source in sources),
         left_out=left_out,
         effective_rows=_effective_rows(drawn, code_of_chosen, weight),
         newest_ns=int(table["logged_ns"].to_numpy().max()),
         as_of_ns=None if mixture.max_age_days is None else as_of_ns,
         others=tuple(others),
         uncertain_rows=int((bools(table, "uncertain") & out.admitted).sum()),
-        ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
+        ratios=tuple(plan.fit for plan in plans if plan.fit is not None),
         warnings=warnings,
     )
 

@@ -32,11 +32,11 @@ from restock.replay.plan.weights import (
     effective_shares,
     estimate_outcomes,
     importance_weights,
-    stands_for,
+    rows_represented,
 )
 
 
-def no_rows(rule: StratumRule) -> str:
+def explain_no_rows(rule: StratumRule) -> str:
     """Return the text for a stratum without rows: what is wrong, and what to change."""
     if rule.name == NOMINAL and rule.where is None and rule.unit == "episode":
         return (
@@ -109,13 +109,13 @@ def plan_source(
     episodes = np.array([len(counts) for counts in per_episode], np.int64)
     draws = mixture.planned_draws * source.part
     rules = [stratum.rule for stratum in strata]
-    untold = {
+    unknown_strata = {
         rule.name: why
         for rule, count in zip(rules, rows, strict=True)
         if not count and rule.where is None and (why := (unknown or {}).get(rule.name))
     }
     empty = [rule for rule, count in zip(rules, rows, strict=True) if not count]
-    lacking = {rule.name: no_rows(rule) for rule in empty}
+    lacking = {rule.name: explain_no_rows(rule) for rule in empty}
     shares = plan_shares(
         mixture,
         rules,
@@ -123,12 +123,14 @@ def plan_source(
         episodes,
         draws=draws,
         natural=natural,
-        unknown=untold,
+        unknown=unknown_strata,
         lacking=lacking,
     )
     wanted = (rule.name for rule, share in zip(rules, shares.wanted, strict=True) if share > 0)
     warnings = tuple(
-        f"{name} {lacking[name]}" for name in wanted if name in lacking and name not in untold
+        f"{name} {lacking[name]}"
+        for name in wanted
+        if name in lacking and name not in unknown_strata
     )
     kept = np.asarray((shares.got > 0)[source.code], np.bool_)
     code, state = source.code[kept], source.state_code[kept]
@@ -138,7 +140,7 @@ def plan_source(
     )
     after = effective_shares(code, weight, shares.got)
     missing = missing_rows(mixture, rows, shares.wanted, draws)
-    missing[[rule.name in untold for rule in rules]] = 0  # more drives would not add any
+    missing[[rule.name in unknown_strata for rule in rules]] = 0  # more drives would not add any
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
     found: dict[str, F64] = {}
     for i in np.flatnonzero(missing).tolist():
@@ -231,7 +233,7 @@ def _outcomes(
         source.state_code[kept],
         code,
         scramble(ids, mixture.seed),
-        stands_for(code, len(strata), natural),
+        rows_represented(code, len(strata), natural),
     )
     names = tuple(strata[index].name for index in estimated.tolist())
     estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)

@@ -165,7 +165,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     )
 
 
-def least_steps(rule: StratumRule, steps: Ints) -> int:
+def required_steps(rule: StratumRule, steps: Ints) -> int:
     """Return the number of rows in which an episode must meet the condition.
 
     `steps` (E,) is the number of rows in which each episode met it. The result is `min_steps`, or
@@ -216,35 +216,35 @@ def deal_episodes(
     rows = np.flatnonzero(np.isin(code, dealt))
     if not len(rows):
         return given
-    here = episode[rows]
+    episode_of_row = episode[rows]
     first_of = np.full(len(given), -1, np.int64)
-    first_of[here[::-1]] = np.arange(len(rows) - 1, -1, -1)
+    first_of[episode_of_row[::-1]] = np.arange(len(rows) - 1, -1, -1)
     names = np.flatnonzero(first_of >= 0)
-    first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[here]
-    may = member[rows[first]][:, dealt]  # (n episodes, K)
+    first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[episode_of_row]
+    allowed = member[rows[first]][:, dealt]  # (n episodes, K)
     size = np.bincount(place, weights=counted[rows]).astype(np.int64)
     # Ties go to the stratum that could get the fewest rows, then by priority.
-    could = (may * size[:, None]).sum(axis=0)
-    filled = [(0, int(could[k]), strata[dealt[k]].priority, k) for k in range(len(dealt))]
+    available = (allowed * size[:, None]).sum(axis=0)
+    filled = [(0, int(available[k]), strata[dealt[k]].priority, k) for k in range(len(dealt))]
     heapq.heapify(filled)
-    choices = may.sum(axis=1)
+    choices = allowed.sum(axis=1)
     waiting = [
-        iter(sorted(np.flatnonzero(of_k).tolist(), key=choices.__getitem__)) for of_k in may.T
+        iter(sorted(np.flatnonzero(of_k).tolist(), key=choices.__getitem__)) for of_k in allowed.T
     ]
     rows_of, taken = size.tolist(), [NO_STRATUM] * len(names)
     while filled:
         so_far, *between, k = filled[0]
-        mine = next((e for e in waiting[k] if taken[e] == NO_STRATUM), None)
-        if mine is None:
+        next_episode = next((e for e in waiting[k] if taken[e] == NO_STRATUM), None)
+        if next_episode is None:
             heapq.heappop(filled)
         else:
-            taken[mine] = int(dealt[k])
-            heapq.heapreplace(filled, (so_far + rows_of[mine], *between, k))
+            taken[next_episode] = int(dealt[k])
+            heapq.heapreplace(filled, (so_far + rows_of[next_episode], *between, k))
     given[names] = taken
     return given
 
 
-def as_dealt(
+def replace_dealt(
     code: NDArray[np.int16],
     given: NDArray[np.int16],
     episode: Codes,

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.plan.candidates import any_order, as_stored, matrix
+from restock.replay.plan.candidates import any_order, matrix, stored_view
 
 BATCH_ROWS = 4_096  # observations in memory at a time
 COLUMNS = 16  # features in memory at a time
@@ -90,7 +90,7 @@ class RowWeights:
         drawn = shares * self._occurs.sum()
         return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
 
-    def under(self, shares: F64) -> F32:
+    def compute(self, shares: F64) -> F32:
         """Return the weights (N,) under these shares (S,)."""
         boost = self.boost(shares)
         table, state_aim = self._table(boost)
@@ -137,10 +137,10 @@ def importance_weights(
     natural: F64 | None = None,
 ) -> F32:
     """Return weights (N,) of the rows of one source; see `RowWeights`."""
-    return RowWeights(code, state_code, strata, rule, outcome, natural).under(shares)
+    return RowWeights(code, state_code, strata, rule, outcome, natural).compute(shares)
 
 
-def stands_for(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
+def rows_represented(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
     """Return how many rows of a natural sample each row represents, (N,), with mean 1."""
     if natural is None:
         return np.ones(len(code))
@@ -203,7 +203,7 @@ class WeightsInForce:
         for at, span, weights in self._parts:
             total = shares[span].sum()
             if len(at) and total > 0:
-                self._weight[at] = weights.under(shares[span] / total)
+                self._weight[at] = weights.compute(shares[span] / total)
 
     def of(self, rows: NDArray[Any]) -> F32:
         """Return the weights (n,) of rows (n,) under the last `set_shares`."""
@@ -315,7 +315,7 @@ class RatioRows:
     state_code: NDArray[np.int16]  # stratum that the state alone would give, -1 for none
     code: NDArray[np.int16]  # stratum
     order: NDArray[np.uint64]  # hashes of ids, by which rows for the fit are chosen
-    stands_for: F64  # how many rows of a natural sample each row represents
+    rows_represented: F64  # how many rows of a natural sample each row represents
 
 
 def estimate_outcomes(
@@ -337,7 +337,7 @@ def estimate_outcomes(
         members = np.flatnonzero(label == outcome)
         some = members[np.argsort(rows.order[members], kind="stable")[:FIT_ROWS]]
         parts.append(some)
-        weights.append(rows.stands_for[some] * (len(members) / max(len(some), 1)))
+        weights.append(rows.rows_represented[some] * (len(members) / max(len(some), 1)))
     chosen, weight = np.concatenate(parts), np.concatenate(weights)
     actions, states = int(rows.action.max()) + 1, np.unique(rows.state_code)
 
@@ -361,7 +361,9 @@ def estimate_outcomes(
         x[[place_of[int(row)] for row in at]] = made
     model = OutcomeModel(x[:split], y[:split], len(estimated) + 1, weight[:split])
     validation = slice(split if split < len(x) else 0, None)
-    base = np.bincount(label, rows.stands_for, len(estimated) + 1) / rows.stands_for.sum()
+    base = (
+        np.bincount(label, rows.rows_represented, len(estimated) + 1) / rows.rows_represented.sum()
+    )
     fit = RatioFit(
         source,
         names,
@@ -388,7 +390,7 @@ def _observations(
     """Yield batches of observations (m, D) of the rows `at`, with their row numbers (m,)."""
     order = np.argsort(ids[at])
     wanted = ids[at][order]
-    query = f"SELECT transition_id, observation FROM {as_stored(connection)}"
+    query = f"SELECT transition_id, observation FROM {stored_view(connection)}"
     with any_order(connection):
         # Matched here instead of in a join, which would keep rows in memory.
         for batch in connection.sql(query).to_arrow_reader(BATCH_ROWS):

@@ -143,7 +143,7 @@ class Reserve(Stateful):
         if beyond and self.rows.any():
             beyond = min(beyond, count)
             if len(self._victims) < beyond:
-                self._choose(beyond)
+                self._choose_victims(beyond)
             victims, self._victims = self._victims[:beyond], self._victims[beyond:]
             slots = np.concatenate([self.appended + np.arange(count - beyond), victims])
         else:
@@ -154,7 +154,7 @@ class Reserve(Stateful):
         self.appended += count
         return slots
 
-    def _choose(self, at_least: int) -> None:
+    def _choose_victims(self, at_least: int) -> None:
         """Choose the slots to overwrite next: the oldest of conditions above their reserve.
 
         If these are too few, for example before the first episode ends, add the oldest unlabelled
@@ -185,7 +185,7 @@ class Reserve(Stateful):
 
 
 UNLABELLED = NONE
-_OF_SLOTS = ("rows", "stratum", "draws")  # arrays with one entry per slot, besides META
+_SLOT_ARRAYS = ("rows", "stratum", "draws")  # arrays with one entry per slot, besides META
 
 # Metadata of rows: name -> type of an array (capacity,).
 META: dict[str, type[np.generic]] = {
@@ -466,7 +466,7 @@ class FreshRing(Stateful):
         condition code, or a row without a label.
         """
         codes = np.asarray(conditions, np.int64)
-        of_strata = codes if strata is None else np.asarray(strata, np.int64)
+        stratum_codes = codes if strata is None else np.asarray(strata, np.int64)
         if len(codes) and not ((codes >= 0) & (codes < len(self.conditions))).all():
             raise MixtureError(
                 f"labels {sorted(set(codes.tolist()))} name no condition of {self.conditions}",
@@ -475,19 +475,19 @@ class FreshRing(Stateful):
         slots = self._awaiting_labels.pop(int(episode_key), np.empty(0, np.int64))
         steps = np.arange(len(slots))
         # Other slots were overwritten by rows of other episodes, or by later rows of this one.
-        still = slots >= 0
-        still &= self.meta["episode"][slots] == episode_key
-        still &= self.meta["episode_step"][slots] == steps
-        slots, steps = slots[still], steps[still]
+        present = slots >= 0
+        present &= self.meta["episode"][slots] == episode_key
+        present &= self.meta["episode_step"][slots] == steps
+        slots, steps = slots[present], steps[present]
         if steps.max(initial=-1) >= len(codes):
             raise MixtureError(
                 f"{len(codes)} labels for an episode of at least {int(steps.max()) + 1} steps",
                 where=f"episode {episode_key} of the fresh ring",
             )
-        for slots_of, found in ((self.by_condition, codes), (self.by_stratum, of_strata)):
+        for slots_of, found in ((self.by_condition, codes), (self.by_stratum, stratum_codes)):
             for code in np.unique(found[steps]):
                 slots_of.move(slots[found[steps] == code], int(code))
-        self.stratum[slots] = of_strata[steps]
+        self.stratum[slots] = stratum_codes[steps]
         return len(slots)
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
@@ -546,16 +546,16 @@ class FreshRing(Stateful):
 
     @property
     def _filled(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of filled slots: `rows` (n, W), and the rest of _OF_SLOTS and META."""
+        """Return the arrays of filled slots: `rows` (n, W), others of _SLOT_ARRAYS and META."""
         filled = len(self)
         meta = {name: values[:filled] for name, values in self.meta.items()}
-        own = {name: getattr(self, name)[:filled] for name in _OF_SLOTS}
+        own = {name: getattr(self, name)[:filled] for name in _SLOT_ARRAYS}
         return {**own, **meta}
 
     @_filled.setter
     def _filled(self, filled: dict[str, NDArray[Any]]) -> None:
         for name, values in filled.items():
-            place = getattr(self, name) if name in _OF_SLOTS else self.meta[name]
+            place = getattr(self, name) if name in _SLOT_ARRAYS else self.meta[name]
             place[: len(values)] = values
 
     def mismatch(self, name: str, value: Any) -> MixtureError:

@@ -210,8 +210,8 @@ def find_places(priority: F32, sums: F32, ends: F64, at: F64, out: Ints) -> None
     rest = (at - (ends[chunk] - sums[chunk])).astype(np.float32)
     upto = np.ascontiguousarray(priority[chunk].T)  # (CHUNK, n)
     # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
-    for before, here in itertools.pairwise(upto):
-        here += before
+    for before, current in itertools.pairwise(upto):
+        current += before
     # The place in the chunk is the number of cumulative sums that are at most `rest`.
     np.add.reduce(upto[:-1] <= rest, axis=0, dtype=np.int8, out=out)
     out += chunk * CHUNK

@@ -227,7 +227,7 @@ class QuotaSampler(Stateful):
         self._ahead_weights: F32 | None = None
         self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
         if self.follows_td:
-            self._place_rows()
+            self._index_rows()
 
     @property
     def batch_size(self) -> int:
@@ -268,13 +268,13 @@ class QuotaSampler(Stateful):
         """
         given = self.quotas.checked(shares)
         if not np.array_equal(given, self.quotas.shares):
-            self._hand_back()
+            self._undo_ahead()
             self.quotas.set_shares(given)
 
     def set_batch_size(self, batch_size: int) -> None:
         """Set the batch size from the next batch on; batches drawn ahead are undone."""
         if batch_size != self.batch_size:
-            self._hand_back()
+            self._undo_ahead()
             self.quotas.set_batch_size(batch_size)
             none: Ints = np.zeros((0, batch_size), np.int64)
             self._ahead_rows, self._ahead_places, self._ahead_strata = none, none, none
@@ -284,17 +284,17 @@ class QuotaSampler(Stateful):
         quota = self.quotas.take(self.block)  # (block, S)
         strata = np.tile(np.arange(len(self.sizes)), self.block)
         # Each stratum's rows of the whole block are drawn at once, then distributed to batches.
-        rows, places, weights = self._take_all(quota.sum(axis=0))
-        order = _by_stratum(quota)
-        self._ahead_rows = _dealt(rows, order).reshape(self.block, -1)
-        self._ahead_places = _dealt(places, order).reshape(self.block, -1)
+        rows, places, weights = self._draw_all(quota.sum(axis=0))
+        order = _block_positions(quota)
+        self._ahead_rows = _scatter(rows, order).reshape(self.block, -1)
+        self._ahead_places = _scatter(places, order).reshape(self.block, -1)
         self._ahead_strata = np.repeat(strata, quota.ravel()).reshape(self.block, -1)
         self._ahead_weights = None
         if weights is not None:
-            self._ahead_weights = _dealt(weights, order).reshape(self.block, -1)
+            self._ahead_weights = _scatter(weights, order).reshape(self.block, -1)
         self._next = 0
 
-    def _take_all(self, counts: Ints) -> tuple[Ints, Ints, F32 | None]:
+    def _draw_all(self, counts: Ints) -> tuple[Ints, Ints, F32 | None]:
         """Draw `counts` (S,) rows, stratum by stratum; return row numbers, places and weights."""
         rows, places, weights = [], [], []
         for stratum, count in enumerate(counts.tolist()):
@@ -311,7 +311,7 @@ class QuotaSampler(Stateful):
             joined = np.concatenate([one if weight is None else weight for weight, one in pairs])
         return np.concatenate(rows), np.concatenate(places), joined
 
-    def _hand_back(self) -> None:
+    def _undo_ahead(self) -> None:
         """Undo batches drawn ahead: restore the quotas' carry, and give rows back to the rules."""
         places, strata = self._ahead_places[self._next :], self._ahead_strata[self._next :]
         quota = np.stack([(strata == s).sum(axis=1) for s in range(len(self.sizes))], axis=1)
@@ -324,7 +324,7 @@ class QuotaSampler(Stateful):
         self._ahead_weights = None
         self._next = 0
 
-    def _place_rows(self) -> None:
+    def _index_rows(self) -> None:
         """Index the stratum and the place of each row number, for `update`."""
         last = max((int(rows.max(initial=-1)) for rows in self._rows), default=-1)
         self._stratum = np.zeros(last + 1, np.int16)
@@ -363,13 +363,13 @@ class QuotaSampler(Stateful):
         )
 
 
-def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:
+def _scatter(values: NDArray[Any], order: Ints) -> NDArray[Any]:
     dealt = np.empty(len(order), values.dtype)
     dealt[order] = values
     return dealt
 
 
-def _by_stratum(quota: Ints) -> Ints:
+def _block_positions(quota: Ints) -> Ints:
     """Return the position of each drawn row in the block, (rows,).
 
     Rows are drawn stratum by stratum. A block is in order of batches, then strata.

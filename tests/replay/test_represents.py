@@ -20,7 +20,7 @@ from restock.replay.panel.logged_sampler import sampler_for
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.plan.strata import ResolvedStratum
-from restock.replay.plan.weights import effective_shares, importance_weights, stands_for
+from restock.replay.plan.weights import effective_shares, importance_weights, rows_represented
 from restock.replay.store.store import Store
 
 TWO = """
@@ -270,7 +270,7 @@ def test_weights_recover_natural_rates_exactly(rows, data, timing):
     weights = importance_weights(code, state, strata, shares, rule, None, rates)
     assert effective_shares(code, weights, shares) == pytest.approx(rates, rel=1e-4)
     # Rows that outcome probabilities are fitted on represent the same rates.
-    represented = stands_for(code, size, rates)
+    represented = rows_represented(code, size, rates)
     assert represented.sum() == pytest.approx(len(code))
     assert np.bincount(code, represented) / len(code) == pytest.approx(rates)
 
@@ -290,7 +290,7 @@ def test_natural_sample_represents_itself(rows, data):
     assert importance_weights(code, code, strata, shares, rule, None, own) == pytest.approx(
         importance_weights(code, code, strata, shares, rule), rel=1e-5
     )
-    assert stands_for(code, size, None).tolist() == [1.0] * len(code)
+    assert rows_represented(code, size, None).tolist() == [1.0] * len(code)
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "other_stores": [msgspec.structs.asdict(store) for store in plan.others],
         "represents": {
             name: rates
-            for name, rates in plan.mixture.sources.said.items()
+            for name, rates in plan.mixture.sources.represented.items()
             if plan.mixture.sources.chosen(name)
         },
         "warnings": list(plan.warnings),
