@@ -183,7 +183,7 @@ def test_what_cannot_be_built_is_said(robot: Robot, message: str) -> None:
 
 def test_a_robot_wider_than_an_aisle_is_refused() -> None:
     task = msgspec.structs.replace(AMR.task, body=Body(2.5, 1.9))
-    with pytest.raises(ConfigError, match=r"1\.9 m wide, and aisle_.* 1\.80 m: it does not fit"):
+    with pytest.raises(ConfigError, match=r"1\.9 m wide, but aisle_.* only 1\.80 m: it does"):
         WarehouseVectorEnv(1, task=task, robot=Robot())
 
 

@@ -442,8 +442,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         specs = msgspec.convert(state["specs"], list[EpisodeSpec])
         if len(specs) != self.num_envs or state["task_hash"] != self.task.hash:
             raise RunError(
-                f"the saved state is of {len(specs)} environments and task {state['task_hash']},"
-                f" this one of {self.num_envs} and task {self.task.hash}",
+                f"the saved state has {len(specs)} environments and task {state['task_hash']}, but"
+                f" there are {self.num_envs} here, with task {self.task.hash}",
                 where="state of the twin",
                 remedy="make the environment as it was made when the state was saved",
             )

@@ -195,15 +195,15 @@ class Warehouse:
                 remedy = "give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres"
                 return f"{what} [{edges}] is not a box within {size}", remedy
         if not 0.05 <= self.room_m <= 3.0:
-            return f"room_m is {self.room_m:g}", "half the robot's width and a margin, .05 to 3 m"
+            return f"room_m is {self.room_m:g}", "give half a robot's width and a margin, .05 to 3"
         if not 0.1 <= self.way_m[0] < self.way_m[1] <= 4 * MAX_SIDE_M:
             what = f"way_m is {self.way_m[0]:g} to {self.way_m[1]:g} m"
-            return what, "the shortest and longest way of a mission, in metres"
+            return what, "give the shortest and longest route of a mission, in metres"
         for x, y in self.goals_m + self.starts_m:
             if not (0 <= x <= self.width_m and 0 <= y <= self.depth_m):
                 what = f"the place [{x:g}, {y:g}] is not within {size}"
                 return what, "give goals and starts in the floor's own frame, in metres"
-        return None if len(self.goals) else ("has no place for a goal", "give docks")
+        return None if len(self.goals) else ("has no place for a goal", "give goals or docks")
 
     @cached_property
     def goals(self) -> F64:

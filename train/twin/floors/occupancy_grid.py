@@ -111,9 +111,9 @@ def with_missions(
     if wider.way_m[1] < 1.5 * longest_m or not wider.starts_m:
         return made
     notes.append(
-        f"the places that the robot was at are at most {longest_m or NEAREST_M:.1f} m apart:"
-        f" missions start there and also go to {len(elsewhere[::step])} places where it could have"
-        " been"
+        f"the robot's places are at most {longest_m or NEAREST_M:.1f} m apart:"
+        f" missions start there and also go to {len(elsewhere[::step])} places that it could"
+        " have reached"
     )
     return wider
 
@@ -296,8 +296,8 @@ def floor_of_grid(
     elsewhere += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
     if not places and not elsewhere:
         raise ConfigError(
-            f"there is no place for a goal for a robot that needs {turn_m:.2f} m around its "
-            "middle to turn",
+            f"there is no place for a goal: the robot needs {turn_m:.2f} m around its middle to"
+            " turn",
             where=where,
             remedy="check [task.body] in the profile, or give a larger map",
         )
@@ -321,7 +321,7 @@ def floor_of_grid(
 
 
 _NO_ROOM_REMEDY = (
-    "check [task.body] in the profile, and of a map.yaml mode, negate and the thresholds"
+    "check [task.body] in the profile, and mode, negate and the thresholds in map.yaml"
 )
 
 
@@ -399,7 +399,7 @@ def _cover_obstacles(
             if cell_m > fine_m:
                 lost = fine.sum() * fine_m**2 - free.sum() * cell_m**2
                 notes.append(
-                    f"simplified to {len(racks)} boxes: cells of {cell_m:g} m in place of"
+                    f"simplified to {len(racks)} boxes: cells of {cell_m:g} m instead of"
                     f" {fine_m:g} m, which takes {lost:.1f} of {fine.sum() * fine_m**2:.1f} m2"
                     " of free floor"
                 )

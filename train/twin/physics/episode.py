@@ -212,8 +212,8 @@ def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
         narrowest = min(floor.segments, key=lambda segment: segment.width_m, default=None)
         if narrowest is not None and body.width_m + AISLE_ROOM_M > narrowest.width_m:
             raise ConfigError(
-                f"the robot is {body.width_m:g} m wide, and {narrowest.name} of {floor.name}"
-                f" {narrowest.width_m:.2f} m: it does not fit",
+                f"the robot is {body.width_m:g} m wide, but {narrowest.name} of {floor.name}"
+                f" only {narrowest.width_m:.2f} m: it does not fit",
                 where="the twin",
                 remedy="choose a floor with wider aisles (env.layouts, `restock twin layout`), or"
                 " correct the outline in [task.body]",
@@ -231,10 +231,9 @@ def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehou
     if saved != own:
         changed = [floor[0] for floor in saved if floor not in own]
         raise RunError(
-            f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
-            f" {len(saved)} floors, not among this one's {len(own)}",
+            f"the saved state is from other floors: {', '.join(changed) or 'fewer, or reordered'}",
             where="state of the twin",
-            remedy="make the environment with the same layouts as then; a file may have changed",
+            remedy="make the environment with the same layouts; a file may have changed since",
         )
 
 

@@ -280,7 +280,7 @@ def _try_out(key: _Key) -> RobotModel:
 def _rolling_radius_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
     """Return the wheels' rolling radius, from the driven and the commanded speed."""
     if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
-        raise _unfit_error(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
+        raise _unfit_error(f"it drives {ahead_mps:.2f} m/s when {speed_mps:.2f} m/s is commanded")
     return robot.wheel_radius_m * ahead_mps / speed_mps
 
 

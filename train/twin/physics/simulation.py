@@ -567,6 +567,6 @@ def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
         f"control_period_s = {period_s} is not a whole number of physics timesteps of "
         f"{timestep_s} s" + (f", in {blocks} equal parts" if blocks > 1 else ""),
         where="task",
-        remedy="use a control period of some hundredths of a second, even above .1 s, as .05, .08"
-        " or .12, or a smaller timestep_s",
+        remedy="use whole hundredths of a second (above .1 s, an even number), such as .05, .08 or"
+        " .12, or a smaller timestep_s",
     )
