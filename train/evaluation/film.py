@@ -128,12 +128,12 @@ def film_evaluation(
             missing.append(f"{scene.name}: driven again it has another {', '.join(differing)}")
             continue
         if scene.other is not None:
-            before = _failure(plan, scene.other)
+            before = _film_failure(plan, scene.other)
             if before is None:
                 other = scene.other["policy"]
                 missing.append(f"{scene.name}: the drive of {other} cannot be repeated exactly")
             else:
-                frames = _beside(before, frames, [_caption(scene.other), _caption(scene.row)])
+                frames = _side_by_side(before, frames, [_caption(scene.other), _caption(scene.row)])
         file = folder / f"{scene.name}.webp"
         write_bytes(file, _animation(frames))
         paths.append(file)
@@ -142,7 +142,7 @@ def film_evaluation(
     return paths, missing
 
 
-def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
+def _film_failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
     """Film another policy's drive; None if it cannot be repeated exactly.
 
     That happens if its run is missing or has changed, or if its actions depend on the other
@@ -232,7 +232,7 @@ def _caption(row: dict[str, Any]) -> str:
     return f"{who}: {ended}, {row['time_s']:.1f} s"
 
 
-def _beside(
+def _side_by_side(
     left: list[NDArray[np.uint8]], right: list[NDArray[np.uint8]], captions: Sequence[str]
 ) -> list[NDArray[np.uint8]]:
     """Put two drives side by side from their first steps, each under its caption.

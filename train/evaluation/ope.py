@@ -293,10 +293,10 @@ def evaluate_planned(
 
 def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:
     """Return notes on the logs, and on the model fitted to them."""
-    return dataset.notes + _beyond_the_model(task, dataset.evaluation, config.model.iterations)
+    return dataset.notes + _warn_of_long_episodes(task, dataset.evaluation, config.model.iterations)
 
 
-def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...]:
+def _warn_of_long_episodes(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...]:
     """Warn of episodes that may take more steps than the model looks ahead."""
     if task.time_limit_steps <= reach:
         return ()

@@ -113,7 +113,7 @@ def load_ope_dataset(
         if logs is None and trained.header.split_by == "within_episode":
             notes.append(f"held out: {trained.header.split_note}, not whole episodes")
         else:
-            ids, left_out = _unseen(store, trained, ids)
+            ids, left_out = _exclude_trained(store, trained, ids)
             if left_out:
                 notes.append(f"{left_out:,} episodes left out: some of their rows were trained on")
         training_store = store if logs is None else opened.enter_context(panel_store(trained))
@@ -132,14 +132,14 @@ def load_ope_dataset(
             rng = np.random.default_rng([seed, 11])
             training_ids = rng.choice(training_ids, MODEL_ROWS, replace=False)
         evaluation = read_steps(store.connection, ids)
-        if hindsight := _by_hindsight(store.connection, ids):
+        if hindsight := _has_hindsight(store.connection, ids):
             notes.append("goals in hindsight are always reached: success is not estimated")
         training = read_steps(training_store.connection, training_ids)
-    for name, steps, asked_for in (
+    for name, steps, requested in (
         ("held-out", evaluation, ids),
         ("panel's", training, training_ids),
     ):
-        if missing := len(asked_for) - len(steps.rows):
+        if missing := len(requested) - len(steps.rows):
             notes.append(f"{missing:,} {name} rows are in other stores, and not used")
         if not len(steps.rows):
             raise StoreError(f"has none of the {name} rows", where=str(training_store.path))
@@ -151,7 +151,7 @@ def _unsplit(trained: Panel) -> bool:
     return not trained.splits and bool(trained.header.split_note)
 
 
-def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
+def _has_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
     """Return whether some of these rows have a goal that was set in hindsight."""
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         ((found,),) = connection.sql(
@@ -262,7 +262,7 @@ def panel_store(panel: Panel) -> Store:
     return Store(panel.header.store, version=panel.store_version)
 
 
-def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
+def _exclude_trained(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
     """Return the rows of episodes without rows in the panel, and the number of episodes left out.
 
     An episode is also left out if it has a copy of one of the panel's rows under another ID.

@@ -365,7 +365,7 @@ def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
         updates=updates,
         training_log_likelihood=_log_likelihood(network, observation, action),
         note=note,
-        **_judged(
+        **_held_out_quality(
             network,
             held_out,
             held_action,
@@ -410,7 +410,7 @@ def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
     return rows.observation, rows.action, None
 
 
-def _judged(
+def _held_out_quality(
     network: QNetwork, observation: F32, action: Ints, frequencies: F32, first: int
 ) -> dict[str, Any]:
     """Compute the fields of a `CloneQuality` that describe held-out rows.

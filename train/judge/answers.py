@@ -20,8 +20,8 @@ from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, 
 from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run, shares_compared
 
 RESAMPLES = 200
-_ANSWERS = 0.4  # share of the expected response; a mission with less does not respond
-_SURELY = 10.0  # expected motion over noise from which a mission's response can be judged
+_MIN_RESPONSE = 0.4  # share of the expected response; a mission with less does not respond
+_MIN_SIGNAL = 10.0  # expected motion over noise from which a mission's response can be judged
 MIN_CLUSTERS = 5
 _RIDGE = 1e-4  # of the mean diagonal; for lags that the rows cannot tell apart
 
@@ -43,7 +43,7 @@ class Response:
     kernel: F64  # (L,)
     moments: F64  # (C, L + 1, L + 1) sums of products of x at each lag and y, per cluster
 
-    def strayed(self, kernel: F64) -> tuple[int, int]:
+    def unresponsive(self, kernel: F64) -> tuple[int, int]:
         """Count the clusters that do not respond as `kernel` predicts, and those that were judged.
 
         A cluster is judged if it moves enough. Both counts are 0 below `MIN_CLUSTERS` of these.
@@ -52,9 +52,9 @@ class Response:
         moved = np.einsum("i,cij,j->c", kernel, xx, kernel)
         gain = (xy @ kernel) / np.maximum(moved, 1e-12)
         noise = self.unexplained * self.moments[:, -1, -1].sum() / self.rows
-        sure = moved > _SURELY**2 * max(noise, 1e-12)
+        sure = moved > _MIN_SIGNAL**2 * max(noise, 1e-12)
         known = sure.sum() >= MIN_CLUSTERS
-        return int((gain < _ANSWERS)[sure].sum() * known), int(sure.sum() * known)
+        return int((gain < _MIN_RESPONSE)[sure].sum() * known), int(sure.sum() * known)
 
 
 def fit_response(
@@ -144,9 +144,9 @@ PLANS = np.arange(-3, 7)
 NOW = np.zeros(1, np.int64)
 _JUMP_RAD, _JUMP_M = 0.8, 0.6  # larger changes in one step mean that the plan was replaced
 _SLOW_MPS = 0.3  # below it a waypoint's bearing changes by turning, not by driving past it
-_AHEAD = 0.5  # largest sine of the waypoint's bearing at which driving shortens the route
-_MOST = 0.5  # least share of the motion that must remain without the rows near slip
-_CLEAN = 0.1  # least share of a recording's motion without slip, to put slip down to the floor
+_MAX_ASIDE = 0.5  # largest sine of the waypoint's bearing at which driving shortens the route
+_MIN_KEPT = 0.5  # least share of the motion that must remain without the rows near slip
+_MIN_CLEAN = 0.1  # least share of a recording's motion without slip, to put slip down to the floor
 _MIN_EPISODES = 5  # recordings with fewer are judged together
 _NEAR_STEPS = 5
 _FAR = 0.97  # lidar entries beyond this saw nothing
@@ -183,7 +183,7 @@ class Relation:
         """Fit the response of y to x; None if the rows are too few or nothing moves."""
         x, y = self.of(rows)
         y = y.copy()
-        y[_left_out(rows, _motion(x, y), leave_out)] = np.nan
+        y[_rows_to_leave_out(rows, _motion(x, y), leave_out)] = np.nan
         if x.ndim == 2:
             cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
@@ -200,9 +200,9 @@ class Relation:
         slip, too, all the time: then nearly every episode of its recording has the label.
         """
         moves = _motion(*self.of(rows))
-        if _on_ice(rows, moves).any():
+        if _find_slippery_episodes(rows, moves).any():
             return "episodes"
-        return "rows" if moves[~_near_slip(rows)].sum() >= _MOST * moves.sum() else "none"
+        return "rows" if moves[~_near_slip(rows)].sum() >= _MIN_KEPT * moves.sum() else "none"
 
 
 def _motion(x: F64, y: F64) -> F64:
@@ -211,13 +211,13 @@ def _motion(x: F64, y: F64) -> F64:
     return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
 
 
-def _left_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
+def _rows_to_leave_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
     if what == "episodes":
-        return _on_ice(rows, moves)
+        return _find_slippery_episodes(rows, moves)
     return _near_slip(rows) if what == "rows" else np.zeros(len(rows), np.bool_)
 
 
-def _slips(rows: FedRows) -> Bools:
+def _find_slip(rows: FedRows) -> Bools:
     """Return which rows (N,) slip: labelled rows of episodes that mostly do not move as the wheels.
 
     A robot that moves as far as its wheels turn, but not where its pose heads, does not slip.
@@ -232,7 +232,7 @@ def _slips(rows: FedRows) -> Bools:
 
 def _near_slip(rows: FedRows) -> Bools:
     """Return which rows (N,) slip or are within `_NEAR_STEPS` of a row that does."""
-    slips = _slips(rows)
+    slips = _find_slip(rows)
     near = slips.copy()
     for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
         place, known = rows.before(lag)
@@ -240,17 +240,17 @@ def _near_slip(rows: FedRows) -> Bools:
     return near
 
 
-def _on_ice(rows: FedRows, moves: F64) -> Bools:
+def _find_slippery_episodes(rows: FedRows, moves: F64) -> Bools:
     """Return which rows (N,) are of episodes with slip, in recordings that also move without it."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
-    slipped = np.bincount(episode, _slips(rows)) > 0  # (E,)
+    slipped = np.bincount(episode, _find_slip(rows)) > 0  # (E,)
     recording = np.unique(rows.recording[first], return_inverse=True)[1] + 1  # (E,)
     recording[np.bincount(recording)[recording] < _MIN_EPISODES] = 0
     moved = np.bincount(episode, moves)
     clean = np.bincount(recording, moved * ~slipped)  # (R,)
-    ice = clean >= np.maximum(_CLEAN * np.bincount(recording, moved), 1e-12)
+    ice = clean >= np.maximum(_MIN_CLEAN * np.bincount(recording, moved), 1e-12)
     return np.asarray((slipped & ice[recording])[episode], np.bool_)
 
 
@@ -267,26 +267,26 @@ def _pose_turn(rows: FedRows) -> F64:
     return np.where(known, turn, np.nan) / rows.task.control_period_s
 
 
-def _sideways(rows: FedRows) -> tuple[F64, F64]:
+def _straight_speeds(rows: FedRows) -> tuple[F64, F64]:
     """Return the pose's speeds forward and sideways (m/s); sideways is NaN in turns."""
     forward, aside = rows.after("localised_speed"), rows.after("lateral_speed")
     straight = np.abs(rows.after("gyro_yaw_rate")) < _STRAIGHT_RADPS
     return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: there was no new pose
 
 
-def _swinging(rows: FedRows) -> tuple[F64, F64]:
+def _turn_and_drift(rows: FedRows) -> tuple[F64, F64]:
     """Return the yaw rate (rad/s) and the pose's speed sideways (m/s; NaN without a new pose)."""
     aside = rows.after("lateral_speed")
     return rows.after("gyro_yaw_rate"), np.where(aside != 0.0, aside, np.nan)
 
 
-def _gained(rows: FedRows) -> F64:
+def _wheel_acceleration(rows: FedRows) -> F64:
     """Return the acceleration of the wheels over the step (m/s2)."""
     change = rows.after("wheel_speed") - rows.now("wheel_speed")
     return np.asarray(change / rows.task.control_period_s)
 
 
-def _turned_waypoint(rows: FedRows) -> F64:
+def _waypoint_turn(rows: FedRows) -> F64:
     """Return the yaw rate (rad/s) by the near waypoint's bearing; NaN if driving or replanning."""
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
@@ -304,7 +304,7 @@ def _route_speed(rows: FedRows) -> F64:
     """
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
     shorter = 10.0 * (now - after)
-    aside = (np.abs(rows.now("near_sin")) > _AHEAD) | (rows.now("near_cos") < 0.0)
+    aside = (np.abs(rows.now("near_sin")) > _MAX_ASIDE) | (rows.now("near_cos") < 0.0)
     shorter[(np.abs(shorter) > _JUMP_M) | (now >= 1.0) | (after >= 1.0) | aside] = np.nan
     return np.asarray(shorter / rows.task.control_period_s)
 
@@ -346,15 +346,15 @@ RELATIONS = (
     Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, POSE, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS,
              unit="rad/s"),
-    Relation("motion of the pose to its heading", POSE, POSE, NOW, lambda rows: _sideways(rows),
+    Relation("motion of the pose to its heading", POSE, POSE, NOW, _straight_speeds,
              zero="turn", most=SIDEWAYS),
-    Relation("motion of the pose to its turn", POSE, POSE, NOW, lambda rows: _swinging(rows),
+    Relation("motion of the pose to its turn", POSE, POSE, NOW, _turn_and_drift,
              zero="arm", most=ARM_M),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
-             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), False,
+             lambda rows: (_wheel_acceleration(rows), 5.0 * rows.after("accel_x")), False,
              offset=BIAS_MPS2, unit="m/s2"),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
-             lambda rows: (rows.after("gyro_yaw_rate"), _turned_waypoint(rows)), False),
+             lambda rows: (rows.after("gyro_yaw_rate"), _waypoint_turn(rows)), False),
     Relation("remaining distance to the speed of the pose", POSE, PLAN, PLANS,
              lambda rows: (rows.after("localised_speed"), _route_speed(rows)), False),
     Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
@@ -368,13 +368,13 @@ NOISY_GAIN = 2.0  # `GAIN` for relations whose x and y are not one quantity
 DELAY_STEPS = 0.6
 LATEST_STEPS = 2.0  # without a twin: how late a robot may respond to its commands
 UNEXPLAINED = 0.2  # largest unexplained share, less the twin's
-_LEFT = 0.5  # largest unexplained share if x and y are one quantity, with a twin or without
+_MAX_LEFT = 0.5  # largest unexplained share if x and y are one quantity, with a twin or without
 NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` if x and y are not one quantity: driver and place matter
 _KNOWN_GAIN = 0.3  # a delay means nothing if the gain over the twin's is smaller
 HELD = 3  # consecutive steps of one action after which the motion counts as that action's
 _MIN_HELD = 15  # rows
-_AWAY = 0.25  # of the fastest action on each axis
-_MAX_ROWS = 0.8  # least share of an action's rows that must move as one other action
+_MIN_DISTANCE = 0.25  # of the fastest action on each axis
+_MIN_SHARE = 0.8  # least share of an action's rows that must move as one other action
 TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and rows left out
 
 
@@ -407,7 +407,7 @@ class Answer:
     def holds(self) -> bool:
         """Return whether the relation holds once it has its own scale, delay and zero."""
         left = self.found.unexplained if self.found is not None else 0.0
-        return not self.is_off("unexplained") and (not self.relation.defined or left <= _LEFT)
+        return not self.is_off("unexplained") and (not self.relation.defined or left <= _MAX_LEFT)
 
     @property
     def fine(self) -> bool:
@@ -500,7 +500,8 @@ def _answer(
     made.append(
         shares_compared(
             f"missions: {name}", "mission without the response of the " + name,
-            found.strayed(expected.kernel), expected.strayed(expected.kernel), -1.0, STRAYED,
+            found.unresponsive(expected.kernel), expected.unresponsive(expected.kernel), -1.0,
+            STRAYED,
         )
     )  # fmt: skip
     by = delay.value if timed else 0.0
@@ -542,11 +543,11 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison
         middle = np.median(away, axis=0)
         nearest = int(np.bincount(away.argmin(axis=1)).argmax())
         share = float((away.argmin(axis=1) == nearest).mean())
-        is_other = nearest != action and middle[action] > _AWAY and share >= _MAX_ROWS
+        is_other = nearest != action and middle[action] > _MIN_DISTANCE and share >= _MIN_SHARE
         # There is no interval: a share of rows decides.
         yield Comparison(
             ACTION + name, what, "distance", "off" if is_other else "ok",
             logs=float(middle[action]), twin=float(middle[nearest]), effect=float(middle[action]),
-            most=_AWAY if is_other else None, logs_rows=len(motion), note=names[nearest],
+            most=_MIN_DISTANCE if is_other else None, logs_rows=len(motion), note=names[nearest],
             p=0.0 if is_other else 1.0,
         )  # fmt: skip

@@ -48,8 +48,8 @@ from restock.train.twin.physics.perturbation import Perturbation
 MIN_ROWS = 500  # fewer rows are never called healthy, and smaller parts are not compared
 MOST = 40  # parts that are compared: the largest ones
 RECORDINGS_CHECK = "recordings"
-_SOME = 0.8  # a fault in a larger share of the parts is reported for all rows
-_NAMED = 3  # parts or files that a text names
+_MAX_PARTS = 0.8  # a fault in a larger share of the parts is reported for all rows
+_MAX_NAMES = 3  # parts or files that a text names
 
 
 @dataclass
@@ -86,7 +86,7 @@ def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
     if not levels or (len(robots) < len(recordings) and not short.any()):
         kind, part = "recordings", logs.recording.astype(object)
         if short.any():
-            kind, part[short] = "groups of recordings", _by_start(logs.take(short))
+            kind, part[short] = "groups of recordings", _group_by_start(logs.take(short))
         levels.append((kind, part.astype(np.str_)))
     compared = []
     for kind, part in levels:
@@ -110,7 +110,7 @@ def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
     )  # fmt: skip
 
 
-def _by_start(logs: FedRows) -> NDArray[np.str_]:
+def _group_by_start(logs: FedRows) -> NDArray[np.str_]:
     """Return the group of each row (N,): recordings that started one after the other.
 
     A group has at least `MIN_ROWS` rows, or more, so that there are at most `MOST` groups.
@@ -129,7 +129,7 @@ def _by_start(logs: FedRows) -> NDArray[np.str_]:
     return np.asarray(named[place], np.str_)
 
 
-def _of_parts(
+def _merge_findings(
     parts: Sequence[Part], each: Sequence[Sequence[Finding]], files: Mapping[str, str]
 ) -> tuple[list[Finding], list[Finding]]:
     """Merge the parts' findings: return those of some robots or recordings, then of all rows."""
@@ -141,25 +141,25 @@ def _of_parts(
             again = sum(one.cause == other.cause for other in of_part[:place])
             by_cause.setdefault((one.cause, part.kind, again), []).append((part, one))
     of_some: list[Finding] = []
-    said: dict[str, str] = {}
+    reported: dict[str, str] = {}  # cause -> kind of parts
     for (cause, kind, _), some in by_cause.items():
-        if said.setdefault(cause, kind) != kind:
+        if reported.setdefault(cause, kind) != kind:
             continue  # already reported by robot
-        if len(some) > _SOME * kinds[kind]:
+        if len(some) > _MAX_PARTS * kinds[kind]:
             if not any(cause == one.cause for one in found):
                 found.append(replace(some[0][1], text=f"in all {kind}: {some[0][1].text}"))
         else:
-            of_some.append(_joined(some, kinds[kind], files))
+            of_some.append(_merge_same(some, kinds[kind], files))
     explained = {check.partition(", ")[0] for one in of_some for check in one.evidence}
     return of_some, [one for one in found if explained.isdisjoint(one.evidence)]
 
 
-def _joined(
+def _merge_same(
     each: Sequence[tuple[Part, Finding]], compared: int, files: Mapping[str, str]
 ) -> Finding:
     """Merge the same finding of several parts into one, with the text of the first."""
-    names = ", ".join(_called(part, files) for part, _ in each[:_NAMED])
-    more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
+    names = ", ".join(_describe_part(part, files) for part, _ in each[:_MAX_NAMES])
+    more = f" and {len(each) - _MAX_NAMES} more" if len(each) > _MAX_NAMES else ""
     first, kind = each[0][1], each[0][0].kind
     return replace(
         first,
@@ -169,15 +169,15 @@ def _joined(
     )
 
 
-def _called(part: Part, files: Mapping[str, str]) -> str:
+def _describe_part(part: Part, files: Mapping[str, str]) -> str:
     """Return a part's name for people: a recording's file, or a robot with its files."""
     recordings = np.unique(part.rows.recording).tolist()
-    names = [files.get(one, one) for one in recordings[:_NAMED]]
+    names = [files.get(one, one) for one in recordings[:_MAX_NAMES]]
     if part.name in recordings:
         return files.get(part.name, part.name)
     if not part.name.startswith("robot ") or not set(recordings) <= files.keys():
         return part.name
-    more = f" and {len(recordings) - _NAMED} more" if len(recordings) > _NAMED else ""
+    more = f" and {len(recordings) - _MAX_NAMES} more" if len(recordings) > _MAX_NAMES else ""
     return f"{part.name}: {', '.join(names)}{more}"
 
 
@@ -276,7 +276,7 @@ def diagnose_rows(
             part.others += compared_values
     correct_over_parts([part.comparisons for part in parts])
     each = [findings(part.answers, part.others, rows.task) for part in parts]
-    of_some, of_all = _of_parts(parts, each, files or {})
+    of_some, of_all = _merge_findings(parts, each, files or {})
     found = of_some + of_all
     comparisons = parts[0].comparisons
     for part in parts[1:]:
@@ -314,18 +314,18 @@ def open_rows(path: Path, profile: Profile | None = None) -> OpenedRows:
                 unflagged("fed labels", "labels against the store's", reason),
                 unflagged("labels", "labels by stored signals", reason),
             ]
-            return OpenedRows(rows, _checked(own, rows, path), missing, {})
+            return OpenedRows(rows, _check_task(own, rows, path), missing, {})
         with Store(store_path, version=version) as store:
-            own = _checked(own, rows, path)
-            compared = [*fed_labels(store, rows), *stored(store, rows, own, _conditions(own))]
-            return OpenedRows(with_missions(store, rows), own, compared, _files(store))
+            own = _check_task(own, rows, path)
+            compared = [*fed_labels(store, rows), *stored(store, rows, own, _twin_conditions(own))]
+            return OpenedRows(with_missions(store, rows), own, compared, _file_names(store))
     if is_store(path):
         with Store(path) as store:
             chosen = store.task().hash
             rows = of_store(store, chosen)
-            own = _checked(profile or _profile_of_store(store, chosen), rows, path)
-            compared = [*stored(store, rows, own, _conditions(own))]
-            return OpenedRows(with_missions(store, rows), own, compared, _files(store))
+            own = _check_task(profile or _profile_of_store(store, chosen), rows, path)
+            compared = [*stored(store, rows, own, _twin_conditions(own))]
+            return OpenedRows(with_missions(store, rows), own, compared, _file_names(store))
     raise RunError(
         "is not a run, a panel or a store" if path.exists() else "does not exist",
         where=str(path),
@@ -333,7 +333,7 @@ def open_rows(path: Path, profile: Profile | None = None) -> OpenedRows:
     )
 
 
-def _checked(own: Profile, rows: FedRows, path: Path) -> Profile:
+def _check_task(own: Profile, rows: FedRows, path: Path) -> Profile:
     """Return the profile; raise ConfigError if the rows are of another task."""
     if own.task.hash == rows.task.hash:
         return own
@@ -345,13 +345,13 @@ def _checked(own: Profile, rows: FedRows, path: Path) -> Profile:
     )
 
 
-def _files(store: Store) -> dict[str, str]:
+def _file_names(store: Store) -> dict[str, str]:
     """Map each recording's ID to its file name."""
     found = store.connection.sql("SELECT recording_id, source_file FROM recordings").fetchall()
     return {str(name): Path(path).name for name, path in found}
 
 
-def _conditions(profile: Profile) -> list[Condition]:
+def _twin_conditions(profile: Profile) -> list[Condition]:
     """Return the profile's conditions that can be computed from the twin's signals."""
     return conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[0]
 
@@ -365,7 +365,7 @@ def _profile_of_store(store: Store, task_hash: str) -> Profile:
 def _drive(
     profile: Profile, perturbation: Perturbation | None, layouts: str
 ) -> tuple[FedRows | None, str]:
-    task, robot, conditions = profile.task, profile.robot, _conditions(profile)
+    task, robot, conditions = profile.task, profile.robot, _twin_conditions(profile)
     try:
         rows = drive_twin(task, conditions, robot=robot, perturbation=perturbation, layouts=layouts)
         return rows, ""

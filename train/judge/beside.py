@@ -21,7 +21,7 @@ from restock.train.judge.fed_rows import Comparison, FedRows, judged, shares_com
 from restock.train.judge.row_checks import implied_reward
 
 MIN_BESIDE = 4  # robots or recordings, of which one can be the odd one out
-_ALIKE = 0.75  # least share of the other robots that must agree with their median
+_MIN_AGREEING = 0.75  # least share of the other robots that must agree with their median
 GAIN = 1.02  # largest gain over the others', or its inverse, for two sensors of one motion
 ANSWER, NOISY = 1.15, 1.25  # the same for responses to commands, and for all other relations
 _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences; the latter of y's mean square
@@ -36,27 +36,27 @@ def beside_others(
     """
     if len(parts) < MIN_BESIDE:
         return [[] for _ in parts]
-    each = [_largest(tallies(rows)) for rows in parts]
-    values = _signals_beside(each)
+    each = [_merge_tallies(tallies(rows)) for rows in parts]
+    values = _compare_tallies(each)
     off = [{row.check for row in of_part if row.off} for of_part in values]
     odd = [
         {"".join(key): one for key, one in of_part.items() if "".join(key) in names}
         for of_part, names in zip(each, off, strict=True)
     ]
     for of_relation in zip(*answers, strict=True):
-        _relation_beside(of_relation)
+        _compare_relation(of_relation)
         if of_relation[0].relation.lags is not ends.NOW:
-            _stretches(of_relation, odd)
+            _compare_stretches(of_relation, odd)
     return values
 
 
-def _relation_beside(answers: Sequence[Answer]) -> None:
+def _compare_relation(answers: Sequence[Answer]) -> None:
     """Compare each robot's figures of one relation with the median of the others."""
     for figure, least, most in _allowed(answers[0].relation):
-        rows = [_of_figure(one, figure) for one in answers]
+        rows = [_find_comparison(one, figure) for one in answers]
         for place, own in enumerate(rows):
             others = [one for other, one in enumerate(rows) if other != place and one is not None]
-            if own is None or (beside := _beside(figure, own, others, least, most)) is None:
+            if own is None or (beside := _compare_figure(figure, own, others, least, most)) is None:
                 continue
             answers[place].comparisons.append(beside)
             if beside.off and beside.effect is not None and figure != "unexplained":
@@ -75,12 +75,12 @@ def _allowed(relation: Relation) -> list[tuple[str, float, float]]:
     ]
 
 
-def _of_figure(answer: Answer, figure: str) -> Comparison | None:
+def _find_comparison(answer: Answer, figure: str) -> Comparison | None:
     """Return the robot's comparison of a figure with the twin; None if there is none."""
     return next((row for row in answer.comparisons if row.check.startswith(f"{figure}: ")), None)
 
 
-def _beside(
+def _compare_figure(
     figure: str, own: Comparison, others: Sequence[Comparison], least: float, most: float
 ) -> Comparison | None:
     """Compare a figure with the median of the others; None if they are too few or do not agree.
@@ -97,10 +97,10 @@ def _beside(
         at, away, far = at / middle, np.log(np.maximum(values / middle, 1e-9)), math.log(most)
     else:
         at, away, far = at - middle, values - middle, most
-    if np.mean(np.abs(away) <= far) < _ALIKE:
+    if np.mean(np.abs(away) <= far) < _MIN_AGREEING:
         return None  # the others may be wrong
     name = own.check.removeprefix(f"{figure}: ")
-    return _only_off(
+    return _accept_undecided(
         judged(
             f"{figure} beside others: {name}",
             own.what,
@@ -115,7 +115,7 @@ def _beside(
     )
 
 
-def _only_off(row: Comparison) -> Comparison:
+def _accept_undecided(row: Comparison) -> Comparison:
     """Turn "undecided" into "ok": robots may differ somewhat without raising suspicion."""
     if not row.off:
         row.status = "ok"
@@ -124,13 +124,13 @@ def _only_off(row: Comparison) -> Comparison:
 
 _WINDOW = 10  # steps of a stretch
 _USUAL, _BROKEN = 0.98, 2.0  # a stretch breaks beyond this quantile of the others' errors, times 2
-_IN_PART = 0.05  # largest share of broken stretches, less the others'
-_FEW = 0.25  # spikes are a smaller share of the rows in broken stretches
-_COUNTS = 0.1  # lags with a smaller share of the kernel's largest weight are ignored
-_STEPS = (*range(-10, 0), *range(1, 11))  # shifts that are tried
+_MAX_BROKEN = 0.05  # largest share of broken stretches, less the others'
+_MAX_SPIKES = 0.25  # spikes are a smaller share of the rows in broken stretches
+_MIN_WEIGHT = 0.1  # lags with a smaller share of the kernel's largest weight are ignored
+_SHIFTS = (*range(-10, 0), *range(1, 11))  # shifts that are tried
 
 
-def _stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) -> None:
+def _compare_stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) -> None:
     """Compare the share of stretches in which a relation breaks between each robot and the others.
 
     All stretches are compared with one response: the median of the robots' fits. `odd` has each
@@ -157,27 +157,27 @@ def _stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) ->
             continue
         most = _BROKEN * float(np.quantile(error, _USUAL))
         broken = errors[place] > most
-        row = _only_off(
+        row = _accept_undecided(
             shares_compared(
                 f"stretches: {relation.name}",
                 f"stretch of {_WINDOW} steps without the answer of {relation.name}",
                 (int(broken.sum()), len(broken)),
                 (int((error > most).sum()), len(error)),
                 -1.0,
-                _IN_PART,
+                _MAX_BROKEN,
             )
         )
         answers[place].comparisons.append(row)
         if row.off:
             usual = np.concatenate([drives[other].left for other in others]).mean()
-            mended = drive.mended(broken, most, usually, _of_ends(relation, kernel, odd[place]))
+            mended = drive.mended(broken, most, usually, _odd_rows(relation, kernel, odd[place]))
             off_by = drive.left[broken].mean() ** 0.5
             answers[place].broken = Broken(off_by, usual**0.5, mended)
 
 
-def _of_ends(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:
+def _odd_rows(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:
     """Return which rows (N,) use an odd value of one of the relation's signals, by check."""
-    lags = relation.lags[np.abs(kernel) > _COUNTS * np.abs(kernel).max()]
+    lags = relation.lags[np.abs(kernel) > _MIN_WEIGHT * np.abs(kernel).max()]
     found = {}
     for check, one in odd.items():
         if one.rows is None or one.signal not in (relation.x, relation.y):
@@ -246,31 +246,31 @@ class Stretches:
         scale = float(p @ y) / max(float(p @ p), 1e-12)
         bias = float((y - p).mean())
         made: dict[str, list[tuple[float, F64]]] = {
-            "shifted": [(float(steps), self._later(steps)) for steps in _STEPS],
+            "shifted": [(float(steps), self._expected_earlier(steps)) for steps in _SHIFTS],
             "scaled": [(scale, expected * scale)],
             "biased": [(bias, expected + bias)],
         }
         far = (measured - expected) ** 2 > most**2 * (expected**2 + usually)
-        if far[inside].mean() < _FEW:
+        if far[inside].mean() < _MAX_SPIKES:
             made["spikes"] = [(float(far.mean()), np.where(far, np.nan, expected))]
         for check, rows in odd.items():
             if (inside & ~rows[self.at]).any():
                 made[check] = [(0.0, np.where(rows[self.at], np.nan, expected))]
         return {
             cause: max(
-                ((self._held(values, broken, most, usually), by) for by, values in each),
+                ((self._share_held(values, broken, most, usually), by) for by, values in each),
                 key=lambda one: one[0],
             )
             for cause, each in made.items()
         }
 
-    def _later(self, steps: int) -> F64:
+    def _expected_earlier(self, steps: int) -> F64:
         """Return the expected y `steps` earlier, (n,); NaN if that is in another episode."""
         row = np.clip(self.at - steps, 0, len(self.expected) - 1)
         same = self.episode[row] == self.episode[self.at]
         return np.where(same, self.expected[row], np.nan)
 
-    def _held(self, expected: F64, broken: Bools, most: float, usually: float) -> float:
+    def _share_held(self, expected: F64, broken: Bools, most: float, usually: float) -> float:
         """Return the share of broken stretches that hold with other expected values (n,).
 
         Rows with NaN are left out.
@@ -349,11 +349,11 @@ def tallies(rows: FedRows) -> Iterator[Tally]:
         known &= np.isfinite(value) & moves & moves[before]
         if known.any() and np.ptp(value[np.isfinite(value)]) > 0:
             period_s, same = rows.task.control_period_s, copied.get(signal, np.zeros_like(known))
-            yield from _repeats(signal, value, before, known, same, period_s)
+            yield from _tally_repeats(signal, value, before, known, same, period_s)
     if rows.task.lidar:
-        yield from _of_lidar(rows)
-    yield from _of_drivers(rows)
-    yield from _of_goals(rows)
+        yield from _tally_lidar(rows)
+    yield from _tally_drivers(rows)
+    yield from _tally_goals(rows)
     off = np.abs(rows.reward - implied_reward(rows))
     yield Tally(REWARDS, "", int((off > _EXACT).sum()), int(np.isfinite(off).sum()))
 
@@ -374,7 +374,7 @@ def _signals(rows: FedRows) -> Iterator[tuple[str, F64, Bools]]:
     yield ends.LIDAR, rows.sectors(after=True).sum(axis=1), drives | turns
 
 
-def _repeats(
+def _tally_repeats(
     signal: str, value: F64, before: Ints, known: Bools, copied: Bools, period_s: float
 ) -> Iterator[Tally]:
     """Count how the values (N,) of a signal repeat in `known` rows.
@@ -418,7 +418,7 @@ def _copies(rows: FedRows) -> Iterator[tuple[str, Bools, Bools, str]]:
         yield signal, moves, moves & (np.abs(value - other) < _SAME), of
 
 
-def _of_drivers(rows: FedRows) -> Iterator[Tally]:
+def _tally_drivers(rows: FedRows) -> Iterator[Tally]:
     """Count, for each driver, the actions that are nearest to navigation's proposal."""
     near, offset, says = proposal_reader(rows.task)
     nearest = (rows.observation @ near.T + offset).argmax(axis=1)
@@ -430,7 +430,7 @@ def _of_drivers(rows: FedRows) -> Iterator[Tally]:
             yield Tally(PROPOSED, name, same, int(own.sum()), note=name)
 
 
-def _of_goals(rows: FedRows) -> Iterator[Tally]:
+def _tally_goals(rows: FedRows) -> Iterator[Tally]:
     """Count truncated episodes after which the recording goes on at the next step."""
     recording = np.unique(rows.recording, return_inverse=True)[1].reshape(-1)
     order = np.lexsort((rows.logged_ns, recording))
@@ -442,7 +442,7 @@ def _of_goals(rows: FedRows) -> Iterator[Tally]:
     yield Tally(REPLACED, "", int(cut.sum()), int(rows.last.sum()))
 
 
-def _of_lidar(rows: FedRows) -> Iterator[Tally]:
+def _tally_lidar(rows: FedRows) -> Iterator[Tally]:
     """Count sectors that differ for one row from the rows around it, see nothing, or read 0."""
     now = rows.sectors()
     (back, first), (on, last) = rows.before(1), rows.before(-1)
@@ -457,7 +457,7 @@ def _of_lidar(rows: FedRows) -> Iterator[Tally]:
     yield Tally(ZEROS, ends.LIDAR, int(zero.sum()), int(moves.sum()))
 
 
-def _signals_beside(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[Comparison]]:
+def _compare_tallies(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[Comparison]]:
     """Compare each tally of a robot with the largest one among the others."""
     made: list[list[Comparison]] = [[] for _ in each]
     for key in sorted({key for of_part in each for key in of_part}):
@@ -482,11 +482,11 @@ def _signals_beside(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[C
                 _KINDS[kind].most,
                 own.note or f"{own.size:.2g}",
             )
-            made[place].append(_only_off(row))
+            made[place].append(_accept_undecided(row))
     return made
 
 
-def _largest(each: Iterator[Tally]) -> dict[tuple[str, str], Tally]:
+def _merge_tallies(each: Iterator[Tally]) -> dict[tuple[str, str], Tally]:
     """Return tallies by kind and signal; of several with the same key, that of the largest share.
 
     Its `rows` are the union of theirs.

@@ -41,10 +41,10 @@ _FIRST = (  # no other check of rows means anything until these are mended
 )
 # Checks of a signal's values. If several are off, the first explains the others.
 OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
-_PARTS = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; ties: the first
+_PARTIAL = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; ties: the first
 _UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # kind -> its name in `Broken.mended`
 _ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # figure that should be 0
-_OPPOSITE, _NONE = -0.6, 0.3  # a scale below these is reversed, or stands still
+_OPPOSITE, _STILL = -0.6, 0.3  # a scale below these is reversed, or stands still
 MENDED = 0.8  # least share of broken stretches that hold once a cause is undone
 CHANGED = "ACTIONS_CHANGED"  # then the profile is not to blame for anything that actions show
 COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion even if all else is right
@@ -77,12 +77,12 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
             of_signals[row.check] = row
         elif row.off:
             (moved if row.check.startswith(ACTION) else rest).append(row)
-    of_rows = _of_rows(rest)
+    of_rows = _row_findings(rest)
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # all else that is off may follow from these
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
-    found, shown = _of_signals(of_signals, of_rows, answers)
-    ends = odd_ends([one for one in answers if not _has(one, shown)])
+    found, shown = _signal_findings(of_signals, of_rows, answers)
+    ends = odd_ends([one for one in answers if not _uses_end(one, shown)])
     one_to_one = len({row.note for row in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
     # Late or early actions look permuted, too.
@@ -90,7 +90,7 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     changed = [one for one in of_rows if one.cause == CHANGED]
     shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # wrong wheels: their motion is unknown
     if not changed and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
-        changed = [_permuted(moved, task)]
+        changed = [_permutation(moved, task)]
     if changed:
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
@@ -99,13 +99,13 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
         ends.pop(LIDAR, None)  # these causes explain it
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
-    found += changed + [_of_end(end, off, task) for end, off in ends.items()]
+    found += changed + [_explain_end(end, off, task) for end, off in ends.items()]
     if any(one.cause == COARSE for one in of_rows):
         found = [one for one in found if one.cause not in ("ACTIONS_MIXED", "COMMAND_SCALED")]
     return found + of_rows
 
 
-def _of_signals(
+def _signal_findings(
     off: dict[str, Comparison], of_rows: Sequence[Finding], answers: Sequence[Answer]
 ) -> tuple[list[Finding], tuple[str, ...]]:
     """Return the findings from signals' own values, and the signals that these explain."""
@@ -118,7 +118,7 @@ def _of_signals(
     for check, row in off.items():
         kind = next(one for one in OF_SIGNALS if check.startswith(one))
         end = check.removeprefix(kind)
-        if _mends(check, [one for one in answers if _has(one, (end,))]):
+        if _repairs_relations(check, [one for one in answers if _uses_end(one, (end,))]):
             by_end.setdefault(end, []).append((kind, row))
     if POSE in by_end or POSE in odd_ends(answers):
         by_end.pop(PLAN, None)  # it is measured from the pose
@@ -128,13 +128,13 @@ def _of_signals(
     for end, rows in by_end.items():
         kind, row = min(rows, key=lambda one: OF_SIGNALS.index(one[0]))
         ends = GROUPS.get(end, (end,))
-        explained = (row for one in answers if _has(one, ends) for row in one.comparisons)
+        explained = (row for one in answers if _uses_end(one, ends) for row in one.comparisons)
         evidence = (*(each.check for _, each in rows), *(row.check for row in explained if row.off))
         found.append(TABLES.ends[kind].finding(evidence, end=end, row=row, key=TABLES.keys[end]))
     return found, shown
 
 
-def _mends(check: str, answers: Sequence[Answer]) -> bool:
+def _repairs_relations(check: str, answers: Sequence[Answer]) -> bool:
     """Return whether most of the broken relations hold without the values that a check found.
 
     Also true if no relation tests this, and for copied and rounded values, which need no proof.
@@ -154,19 +154,19 @@ def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
     while left:
         worth = {
             name: (
-                sum(_has(one, ends) for one in left),
-                -sum(_has(one, ends) for one in fine),
+                sum(_uses_end(one, ends) for one in left),
+                -sum(_uses_end(one, ends) for one in fine),
                 name not in GROUPS,
             )
             for name, ends in candidates.items()
         }
         best = max(worth, key=worth.__getitem__)
-        odd[best] = [one for one in left if _has(one, candidates[best])]
+        odd[best] = [one for one in left if _uses_end(one, candidates[best])]
         left = [one for one in left if one not in odd[best]]
     return odd
 
 
-def _has(answer: Answer, ends: tuple[str, ...]) -> bool:
+def _uses_end(answer: Answer, ends: tuple[str, ...]) -> bool:
     return answer.relation.x in ends or answer.relation.y in ends
 
 
@@ -189,16 +189,16 @@ def _is_shift(scale: float, delay: float) -> bool:
     return 1 / GAIN <= scale <= GAIN and abs(delay) > DELAY_STEPS
 
 
-def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
+def _explain_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     """Return the cause which, once undone, makes an end's relations hold; else describe them."""
     rows = [row for one in off for row in one.comparisons if row.off]
     named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # figure -> its first row
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
     scale, steps, bias = (*_distortion(end, off), 0.0)
-    kind, some, mended, in_part = "", named.get("stretches"), _mended(end, off), ""
+    kind, some, mended, in_part = "", named.get("stretches"), _shares_mended(end, off), ""
     if all(one.holds for one in off):
         bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
-        kind = _of_all(end, scale, steps, off, named)
+        kind = _constant_fault(end, scale, steps, off, named)
         if mended and mended.get(_UNDONE.get(kind, kind), (1.0, 0.0))[0] < MENDED:
             kind = ""
     if not kind and mended:
@@ -207,7 +207,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         if share >= MENDED:
             scale, steps, bias = (by * (best == one) for one in ("scaled", "shifted", "biased"))
             kind, in_part = best, TABLES.in_part.format(some=some)
-            if best == "scaled" and by < _NONE:
+            if best == "scaled" and by < _STILL:
                 kind = "reversed" if by < _OPPOSITE else "still"
     gain = 1 / scale if scale else math.inf
     units = ((scale, ""), (gain, "the inverse of "))
@@ -224,12 +224,12 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         seconds=abs(steps) * task.control_period_s, degrees=abs(degrees),
         side="left" if degrees > 0 else "right", arm=arm, bias=bias, rate=off[0].relation.unit,
         unlike="ACTIONS_MIXED" if is_action else "SENSOR_MIXED" if some else "UNLIKE_TWIN",
-        does="do" if end in GROUPS else "does", how=_how(end, off, named),
+        does="do" if end in GROUPS else "does", how=_describe_mismatch(end, off, named),
     )  # fmt: skip
     return replace(found, text=in_part + found.text)
 
 
-def _of_all(
+def _constant_fault(
     end: str, scale: float, steps: float, off: Sequence[Answer], named: Container[str]
 ) -> str:
     """Return the kind of a fault that is the same in all rows; "" if it is not clear."""
@@ -244,7 +244,7 @@ def _of_all(
     return next((kind for figure, kind in _ZEROS.items() if figure in named), "")
 
 
-def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
+def _shares_mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
     """Return the share of broken stretches that hold once each cause is undone, and its size.
 
     Both are medians over the end's relations. Empty if no relation breaks in some stretches only.
@@ -254,7 +254,7 @@ def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
     for one in off:
         if one.broken is None or not one.is_off("stretches"):
             continue
-        for cause in _PARTS:
+        for cause in _PARTIAL:
             share, by = one.broken.mended.get(cause, (0.0, 1.0))
             if one.relation.y not in ends:  # the end is the relation's x
                 by = 1 / by if cause == "scaled" and by else -by
@@ -268,7 +268,7 @@ def _mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
     }
 
 
-def _how(end: str, off: Sequence[Answer], named: Mapping[str, Comparison]) -> str:
+def _describe_mismatch(end: str, off: Sequence[Answer], named: Mapping[str, Comparison]) -> str:
     """Describe which signals an end does not follow, in how much of the drive, and by how much."""
     ends = GROUPS.get(end, (end,))
     signals = dict.fromkeys(one for each in off for one in (each.relation.x, each.relation.y))
@@ -291,7 +291,7 @@ def _surely_reversed(off: Sequence[Answer]) -> bool:
     return bool(gains) and all(row.high is not None and row.high < 0 for row in gains)
 
 
-def _permuted(moved: Sequence[Comparison], task: Task) -> Finding:
+def _permutation(moved: Sequence[Comparison], task: Task) -> Finding:
     motion = dict(zip(task.action_names, task.actions, strict=True))
     names = [(row.check.removeprefix(ACTION), row.note) for row in moved]
     mirror = all(motion[of] == (motion[name][0], -motion[name][1]) for name, of in names)
@@ -304,7 +304,7 @@ def _permuted(moved: Sequence[Comparison], task: Task) -> Finding:
     )
 
 
-def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
+def _row_findings(off: Sequence[Comparison]) -> list[Finding]:
     """Return the findings of checks that imply their cause; a check counts for one finding only."""
     left = {row.check: row for row in off}
     if "driver" in left:  # the wrong driver also explains how many of its actions are proposals

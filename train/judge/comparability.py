@@ -115,24 +115,24 @@ def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Che
                 continue
             with np.errstate(invalid="ignore"):  # a resample without rows is NaN: inconclusive
                 a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
-            checks.append(_distance(name, part, a, b, limit))
+            checks.append(_check_distance(name, part, a, b, limit))
             if tenth is None:
-                checks += _ratios(first.cells, name, a, b)
-    return checks + _unlabelled(first, second) + _episodes(first, second)
+                checks += _check_ratios(first.cells, name, a, b)
+    return checks + _check_unlabelled(first, second) + _check_episodes(first, second)
 
 
-def _ratios(cells: Sequence[str], name: str, a: F64, b: F64) -> list[Check]:
+def _check_ratios(cells: Sequence[str], name: str, a: F64, b: F64) -> list[Check]:
     after = " after weights" if name.endswith("weights") else ""
     checks = []
     for index, cell in enumerate(cells):
         shares = float(a[0, index]), float(b[0, index])
         if max(shares) < LIMITS.share_floor:
             continue
-        checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index]))
+        checks.append(_check_ratio(f"share of {cell}{after}", a[:, index], b[:, index]))
     return checks
 
 
-def _unlabelled(first: Feed, second: Feed) -> list[Check]:
+def _check_unlabelled(first: Feed, second: Feed) -> list[Check]:
     """Check the share of fresh rows drawn before they had labels, if it is large in a feed."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
@@ -147,28 +147,28 @@ def _unlabelled(first: Feed, second: Feed) -> list[Check]:
     return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, LIMITS.unlabelled)]
 
 
-def _episodes(first: Feed, second: Feed) -> list[Check]:
+def _check_episodes(first: Feed, second: Feed) -> list[Check]:
     """Compare the numbers of episodes that each cell was drawn from; these are not random."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
     for index, cell in enumerate(first.cells):
         if max(total[index] for total in totals) < LIMITS.share_floor:
             continue
-        one, other = _episodes_a_run(first, index), _episodes_a_run(second, index)
+        one, other = _episodes_per_run(first, index), _episodes_per_run(second, index)
         value = max(one, other) / min(one, other) if min(one, other) else math.inf
         name = f"episodes of {cell}"
         checks.append(Check.exact(name, one, other, value, LIMITS.episode_ratio))
     return checks
 
 
-def _episodes_a_run(feed: Feed, cell: int) -> float:
+def _episodes_per_run(feed: Feed, cell: int) -> float:
     """Return the distinct episodes that a cell was drawn from, averaged over the arm's runs."""
-    here = feed.cell == cell
-    pairs = np.stack([feed.run[here], feed.episode[here]])
+    drawn = feed.cell == cell
+    pairs = np.stack([feed.run[drawn], feed.episode[drawn]])
     return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
 
 
-def _distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check:
+def _check_distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check:
     """Check the total variation distance of two mixes (1 + R, C): originals, then resamples."""
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
@@ -180,7 +180,7 @@ def _distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check:
     return Check(name, part, None, None, value, max(low, 0.0), high, limit)
 
 
-def _ratio(name: str, a: F64, b: F64) -> Check:
+def _check_ratio(name: str, a: F64, b: F64) -> Check:
     """Check the larger share over the smaller; a, b (1 + R,) are originals, then resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)

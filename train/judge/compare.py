@@ -215,7 +215,7 @@ def _outcome(
     b: F64,
 ) -> dict[str, Any]:
     difference = difference_of_arms(a[..., 0], b[..., 0]).within(-1.0, 1.0)
-    missing = _why_no_interval(a, b, difference)
+    missing = _explain_no_interval(a, b, difference)
     # Compares each episode over all pairs of runs.
     better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
     few = min(len(a), len(b)) < MIN_RUNS or a.shape[1] < MIN_EPISODES
@@ -241,7 +241,7 @@ def _known(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
+def _explain_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
     """Explain why an interval would claim too much; None if it would not. a, b as in `_outcome`."""
     if np.isnan(difference.value):
         return "the task has no goal: compare the returns"

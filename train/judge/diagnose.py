@@ -76,15 +76,16 @@ def diagnose(runs: Sequence[Run]) -> Diagnosis:
     """
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
-    figures = [median_window(its[-WINDOWS:]) for its in windows]
-    verdicts = [_verdict(*its) for its in zip(runs, windows, figures, strict=True)]
+    figures = [median_window(of_run[-WINDOWS:]) for of_run in windows]
+    verdicts = [_verdict(*of_run) for of_run in zip(runs, windows, figures, strict=True)]
     causes = [cause for cause, _ in verdicts]
     ((cause, votes), *_) = Counter(causes).most_common()
     advice = "; ".join(dict.fromkeys(advice for _, advice in verdicts if advice))
     if votes <= len(causes) / 2:
         cause = "UNDETERMINED"
         advice = f"train longer, or with more seeds: the runs do not agree ({', '.join(causes)})"
-    shown = [one for one, its in zip(figures, causes, strict=True) if its == cause] or figures
+    agreeing = [window for window, own in zip(figures, causes, strict=True) if own == cause]
+    shown = agreeing or figures
     return Diagnosis(
         cause,
         causes,
@@ -129,7 +130,7 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
             f"{counted(len(last), 'evaluation')}, and the verdict needs {WINDOWS}"
         )
     lagging = any(not window.lag < LIMITS.lag for window in last)
-    if lagging and (young := _too_young(last, target_rule(run))):
+    if lagging and (young := _explain_youth(last, target_rule(run))):
         return "UNDETERMINED", f"train longer: {young}"
     if len({bool(window.target()) for window in last}) > 1:
         return "UNDETERMINED", (
@@ -144,7 +145,7 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
     return cause, many if cause == "UNDETERMINED" else ""
 
 
-def _too_young(last: Sequence[Window], rule: TargetRule) -> str:
+def _explain_youth(last: Sequence[Window], rule: TargetRule) -> str:
     """Explain why the run may be too young to judge an L past its limit; "" if it is not.
 
     While values grow from 0, every target lags. But if a rule is so slow that no run would be old
@@ -206,7 +207,7 @@ def _experiment(
     }[cause]
 
 
-_TOGETHER: dict[Cause, Cause] = {  # cause by a run's figures -> cause if its rows are wrong, too
+_WITH_WRONG_ROWS: dict[Cause, Cause] = {  # a run's cause -> its cause if its rows are wrong, too
     "HEALTHY": "BUFFER",
     "UNDETERMINED": "BUFFER",
     "TARGET": "BOTH",
@@ -240,21 +241,21 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
     """Combine the verdicts on a run and on its rows; sound rows change nothing."""
     if not rows.findings:
         return diagnosis
-    cause = _TOGETHER.get(diagnosis.cause, diagnosis.cause)
+    cause = _WITH_WRONG_ROWS.get(diagnosis.cause, diagnosis.cause)
     experiment = diagnosis.experiment
     if cause in ("BUFFER", "BOTH"):
         experiment = f"first correct the rows ({rows.findings[0].remedy}), mix and train again"
-    said = []
+    reasons = []
     if cause != diagnosis.cause:
         whose = "the run's own figures" if len(diagnosis.runs) == 1 else "the runs' own figures"
-        said = [f"{diagnosis.cause} by {whose}, {cause} with the rows that were fed:"]
-    said += [f"rows: {one.cause}: {one.text}" for one in rows.findings]
+        reasons = [f"{diagnosis.cause} by {whose}, {cause} with the rows that were fed:"]
+    reasons += [f"rows: {one.cause}: {one.text}" for one in rows.findings]
     return replace(
-        diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
+        diagnosis, cause=cause, evidence=[*diagnosis.evidence, *reasons], experiment=experiment
     )
 
 
-_NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
+_UNCONFIRMABLE: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
 
 def check_place(out: Path) -> None:
@@ -288,12 +289,12 @@ def confirm(
     check_place(out)
     config, where = run.document["config"], str(run.path)
     cause, remedy = diagnosis.cause, diagnosis.experiment
-    changed = [] if cause in _NOTHING else swapped(run, cause)
+    changed = [] if cause in _UNCONFIRMABLE else swapped(run, cause)
     what = None
-    if rows_at_fault and cause in _NOTHING:
+    if rows_at_fault and cause in _UNCONFIRMABLE:
         what = "by its own figures, and only its rows are at fault: another run cannot confirm that"
         remedy = "correct the rows, mix again, and check them with `restock diagnose PANEL`"
-    elif cause in _NOTHING:
+    elif cause in _UNCONFIRMABLE:
         what = "there is nothing to confirm"
     elif parse_config(apply_overrides(config, changed), where=where) == parse_config(
         config, where=where

@@ -90,11 +90,11 @@ def judged(
         check, what, measure, status, logs, twin,
         interval.value, interval.low, interval.high,
         None if math.isinf(least) else least, None if math.isinf(most) else most,
-        logs_rows, twin_rows, note, _beyond(interval, least, most),
+        logs_rows, twin_rows, note, _p_value(interval, least, most),
     )  # fmt: skip
 
 
-def _beyond(interval: ConfidenceInterval, least: float, most: float) -> float:
+def _p_value(interval: ConfidenceInterval, least: float, most: float) -> float:
     """Return the one-sided p-value of the nearest allowed value, from the interval's width."""
     value = interval.value
     if value > most:
@@ -303,21 +303,21 @@ def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
         PanelError: a row's action is not among the task's.
     """
     meta = panel.meta
-    order = _by_step(meta)
+    order = _order_by_step(meta)
     counts = np.unique(_text(meta, "episode_id"), return_counts=True)[1]
-    kept = np.repeat(np.isin(np.arange(len(counts)), _some(counts, most)), counts)
+    kept = np.repeat(np.isin(np.arange(len(counts)), _choose_episodes(counts, most)), counts)
     order = order[kept]
     packed = np.asarray(panel.rows[order])
     rows = FedRows(
         task=panel.task,
         observation=packed[:, panel.columns["observation"]],
         next_observation=packed[:, panel.columns["next_observation"]],
-        left_out=_not_looked_at(int((~kept).sum())),
+        left_out=_count_left_out(int((~kept).sum())),
         **_columns(meta, order),
     )
     _check_actions(rows, PanelError, str(panel.path))
     far = _numbers(meta, "horizon")[order] > 1
-    return _one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
+    return _with_one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
 
 
 def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
@@ -334,7 +334,7 @@ def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
     if not len(counted):
         raise StoreError(f"no transitions of task {task_hash}", where=str(store.path))
     counts = counted["rows"].to_numpy()
-    kept = _some(counts, most)
+    kept = _choose_episodes(counts, most)
     wanted = counted.select(["episode_id"]).take(pa.array(kept))
     named = ("primary_condition AS condition" if n == "condition" else n for n in _COLUMNS)
     with passed_in(store.connection, wanted=wanted):
@@ -343,13 +343,13 @@ def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
             " WHERE task_hash = $task",
             params={"task": task_hash},
         ).to_arrow_table()
-    order = _by_step(table)
+    order = _order_by_step(table)
     task = store.task(task_hash)
     rows = FedRows(
         task=task,
         observation=_vectors(table["observation"], task.observation_size)[order],
         next_observation=_vectors(table["next_observation"], task.observation_size)[order],
-        left_out=_not_looked_at(int(counts.sum()) - len(order)),
+        left_out=_count_left_out(int(counts.sum()) - len(order)),
         **_columns(table, order),
     )
     _check_actions(rows, StoreError, str(store.path))
@@ -371,18 +371,18 @@ def _check_actions(rows: FedRows, error: type[RestockError], where: str) -> None
         )
 
 
-def _some(counts: Ints, most: int) -> Ints:
+def _choose_episodes(counts: Ints, most: int) -> Ints:
     """Choose which episodes (E,) to read: all, or enough for about `most` rows."""
     shuffled = np.random.default_rng(0).permutation(len(counts))
     return np.sort(shuffled[np.cumsum(counts[shuffled]) <= max(most, counts[shuffled[:1]].sum())])
 
 
-def _by_step(table: pa.Table) -> Ints:
+def _order_by_step(table: pa.Table) -> Ints:
     episode = np.unique(_text(table, "episode_id"), return_inverse=True)[1].reshape(-1)
     return np.lexsort((_numbers(table, "step_index"), episode))
 
 
-def _not_looked_at(rows: int) -> dict[str, int]:
+def _count_left_out(rows: int) -> dict[str, int]:
     return {"in episodes beyond the limit of rows to check": rows} if rows else {}
 
 
@@ -403,7 +403,7 @@ def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
     }
 
 
-def _one_step(rows: FedRows, far: Bools) -> FedRows:
+def _with_one_step(rows: FedRows, far: Bools) -> FedRows:
     """Replace next observations that are several steps ahead (`far`) by those of the next step."""
     following, known = rows.before(-1)
     after = rows.next_observation.copy()
@@ -481,10 +481,10 @@ def drive_twin(
         )
         observation = after
     env.close()
-    return _ended(task, conditions, taken)
+    return _rows_of_ended_episodes(task, conditions, taken)
 
 
-def _ended(
+def _rows_of_ended_episodes(
     task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
 ) -> FedRows:
     """Return the rows of valid episodes that ended, robot by robot, from T steps of N robots."""

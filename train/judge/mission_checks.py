@@ -59,16 +59,16 @@ RANGE_M = 0.1
 BLIND = 0.0  # of the sectors
 _LOOKS, _RAYS = 800, 3  # rows that are compared, and rays per sector
 _NEARBY = 0.6  # of the lidar's range: nearer walls should be seen
-_BETTER = 0.05  # least gain in the share that agrees, for a move of the racks to be applied
-_LOOKED = 40  # ranges without which a sector or a mission is not judged
+_MIN_GAIN = 0.05  # least gain in the share that agrees, for a move of the racks to be applied
+_MIN_LOOKS = 40  # ranges without which a sector or a mission is not judged
 DRIVEN = "driver"
 OTHER_DRIVER = 0.1  # of the stretches
-_ALIKE = 0.1  # largest share of the others' stretches that may be taken for another driver's
+_MAX_CONFUSED = 0.1  # largest share of the others' stretches that may be taken for another driver's
 _STRETCH = 10  # steps
 CHOSEN = "chosen on outcome: "
 GAP = 0.3  # in the share of episodes that succeed
 _MIN_MISSIONS = 5  # with a condition, and without it
-_MET = 0.2  # share of a condition's episodes in which its situations (exposures) occur
+_MIN_EXPOSED = 0.2  # share of a condition's episodes in which its situations (exposures) occur
 
 _SIGNALS = (
     f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
@@ -108,14 +108,14 @@ def mission_checks(
 
     `others` are the rows of the other robots or recordings, if `logs` are only a part.
     """
-    yield _lost(logs)
-    yield _nearer(logs, twin)
-    yield from _on_floor(logs, floors, twin)
-    yield from _chosen(logs)
-    yield _driven(logs, others)
+    yield _check_lost_rows(logs)
+    yield _check_goals(logs, twin)
+    yield from _check_floor(logs, floors, twin)
+    yield from _check_outcomes(logs)
+    yield _check_driver(logs, others)
 
 
-def _lost(rows: FedRows) -> Comparison:
+def _check_lost_rows(rows: FedRows) -> Comparison:
     what = "row that ingest wrote for a recording and that is gone"
     if rows.counted is None:
         return not_run(LOST, what, "no store")
@@ -124,16 +124,16 @@ def _lost(rows: FedRows) -> Comparison:
     return share_judged(LOST, what, int(gone), int(written.sum()), 0.0)
 
 
-def _nearer(logs: FedRows, twin: FedRows | None) -> Comparison:
+def _check_goals(logs: FedRows, twin: FedRows | None) -> Comparison:
     what = "mission drives without coming nearer to its goal"
     if logs.task.goal == "none" or logs.pose is None:
         reason = "no store with poses" if logs.pose is None else "the task has no goal"
         return not_run(NEARER, what, reason)
-    expected = (0, 1000) if twin is None else _strayed(twin)
-    return shares_compared(NEARER, what, _strayed(logs), expected, -1.0, AWAY)
+    expected = (0, 1000) if twin is None else _count_strayed(twin)
+    return shares_compared(NEARER, what, _count_strayed(logs), expected, -1.0, AWAY)
 
 
-def _strayed(rows: FedRows) -> tuple[int, int]:
+def _count_strayed(rows: FedRows) -> tuple[int, int]:
     """Count the missions whose plan does not become shorter, and those that were judged.
 
     Short missions are not judged, nor those that end in a bump, which may have had no goal.
@@ -155,7 +155,7 @@ def _strayed(rows: FedRows) -> tuple[int, int]:
     return int(strayed[long].sum()), int(long.sum())
 
 
-def _on_floor(
+def _check_floor(
     rows: FedRows, floors: Sequence[Warehouse], twin: FedRows | None
 ) -> Iterator[Comparison]:
     """Find the move of the twin's racks that fits the lidar best, and test it on other missions.
@@ -190,7 +190,7 @@ def _on_floor(
     share, floor, move, own, near = max(by_floor, key=lambda one: one[0])
     driven = into_frame(rows.pose[np.isfinite(rows.pose).all(axis=1), :2], floor.map_origin)
     distance = float(np.hypot(*move))
-    ranges = list(_ranges(rows, floor, move, twin))
+    ranges = list(_check_ranges(rows, floor, move, twin))
     if on_free_ground(floor, driven + move).mean() < PLACED or not ranges:
         reason = (
             f"these logs are of another floor ({share:.0%} of the lidar's returns lie on racks of"
@@ -200,7 +200,7 @@ def _on_floor(
         yield not_run(FLOOR, what, reason)
         return
     still = from_walls_m(floor, own) < NEAR_M
-    gains = _by_mission(near.astype(float) - still, mission, ~first)
+    gains = _mean_by_mission(near.astype(float) - still, mission, ~first)
     better = ttest_1samp(gains, 0.0, alternative="greater")
     p = float(better.pvalue) if distance > MOVED_M and np.ptp(gains) > 0 else 1.0
     sides = ((-move[0], "east", "west"), (-move[1], "north", "south"))
@@ -217,7 +217,7 @@ def _on_floor(
     yield from ranges
 
 
-def _ranges(
+def _check_ranges(
     rows: FedRows, floor: Warehouse, move: F64, twin: FedRows | None
 ) -> Iterator[Comparison]:
     """Compare each sector's ranges with the distances to the floor's racks and walls.
@@ -230,14 +230,14 @@ def _ranges(
     kept = kept[:: len(kept) // _LOOKS + 1]
     clearance, best = rows.sectors()[kept] ** 2 * rows.task.range_max_m, ON_FLOOR
     for by in (np.zeros(2), move):
-        least, most = _expected(rows.task, floor, rows.pose[kept], by)
+        least, most = _expected_clearance(rows.task, floor, rows.pose[kept], by)
         shown = (least > 0.1) & (least < _NEARBY * rows.task.range_max_m) & (most - least < 0.6)
         if twin is not None:
             shown &= (twin.sectors() < 1.0).any(axis=0)  # those that the twin's lidar covers
         off = clearance - least
         near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
         if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
-            plain, away, alike, best = shown, off, near, share + _BETTER
+            plain, away, alike, best = shown, off, near, share + _MIN_GAIN
     if best == ON_FLOOR:
         return
     cluster = np.broadcast_to(rows.cluster[kept][:, None], away.shape)[plain]
@@ -248,7 +248,7 @@ def _ranges(
     yield judged(RANGES, what, "difference", middle, logs=middle.value, twin=0.0, least=-RANGE_M,
                  most=RANGE_M, logs_rows=len(kept))  # fmt: skip
     looked, seen = plain.sum(axis=0), (alike & plain).sum(axis=0)
-    blind, judged_ones = seen < looked / 2, looked >= _LOOKED
+    blind, judged_ones = seen < looked / 2, looked >= _MIN_LOOKS
     bearings = (np.flatnonzero(blind & judged_ones) + 0.5) * 360 / rows.task.sectors - 180
     what = "sector that mostly does not see the floor's racks and walls"
     yield share_judged(SECTORS, what, len(bearings), int(judged_ones.sum()), BLIND,
@@ -256,13 +256,13 @@ def _ranges(
     plain &= ~blind
     mission = np.unique(rows.episode[kept], return_inverse=True)[1].reshape(-1)
     looked, seen = (np.bincount(mission, one.sum(axis=1)) for one in (plain, alike & plain))
-    blind, judged_ones = seen < looked / 2, looked >= _LOOKED
+    blind, judged_ones = seen < looked / 2, looked >= _MIN_LOOKS
     what = "mission in which the lidar mostly does not see the floor's racks where they are"
     yield share_judged(ON_RACKS, what, int((blind & judged_ones).sum()), int(judged_ones.sum()),
                        AWAY)  # fmt: skip
 
 
-def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, F64]:
+def _expected_clearance(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, F64]:
     """Return the clearance (N, S) expected in each sector from poses (N, 3), from racks and walls.
 
     Returns the minimum and the maximum over `_RAYS` rays of the sector.
@@ -285,45 +285,47 @@ def _expected(task: Task, floor: Warehouse, pose: F64, move: F64) -> tuple[F64, 
     return clear.min(axis=2), clear.max(axis=2)
 
 
-def _driven(rows: FedRows, others: FedRows | None) -> Comparison:
+def _check_driver(rows: FedRows, others: FedRows | None) -> Comparison:
     """Compare the stored driver with the driver in the other rows whose style is most similar."""
     what = "stretch that is driven in the style of another driver"
     if others is None or rows.driver is None or others.driver is None:
         return not_run(DRIVEN, what, "no other rows of a store to compare with")
     names = [name for name in np.unique(others.driver).tolist() if name]
-    stretch = [_stretches(one) for one in (rows, others)]
+    stretch = [_split_by_driver(one) for one in (rows, others)]
     names = [one for one in names if (stretch[1][1] == one).sum() >= _MIN_MISSIONS]
     if len(names) < 2:
         return not_run(DRIVEN, what, "fewer than two known drivers in the other rows")
-    style, known = _style(others), np.isin(others.driver, names)
+    style, known = _driving_features(others), np.isin(others.driver, names)
     middle, spread = style[known].mean(axis=0), style[known].std(axis=0) + 1e-9
-    (style, own) = ((each - middle) / spread for each in (style, _style(rows)))
+    (style, own) = ((each - middle) / spread for each in (style, _driving_features(rows)))
     right = np.stack([others.driver == name for name in names], axis=1)[known]
     weight = (right / right.sum(axis=0)).sum(axis=1, keepdims=True)  # equal total per driver
     square = (style[known] * weight).T @ style[known] + 1e-3 * np.eye(style.shape[1])
     fit = np.linalg.solve(square, (style[known] * weight).T @ right)
     level = (style[known] * weight).sum(axis=0) / len(names) @ fit
 
-    def wrong(one: FedRows, style: F64, of: tuple[Ints, NDArray[np.str_]]) -> tuple[int, int]:
+    def count_wrong(one: FedRows, style: F64, of: tuple[Ints, NDArray[np.str_]]) -> tuple[int, int]:
         each = (np.bincount(of[0]) >= _STRETCH) & np.isin(of[1], names)
         like = np.stack([np.bincount(of[0], score) for score in (style @ fit - level).T], axis=1)
-        said = np.array(names)[like.argmax(axis=1)]
-        return int((said != of[1])[each].sum()), int(each.sum())
+        predicted = np.array(names)[like.argmax(axis=1)]
+        return int((predicted != of[1])[each].sum()), int(each.sum())
 
-    usual = wrong(others, style, stretch[1])
-    if usual[0] > _ALIKE * usual[1]:
+    usual = count_wrong(others, style, stretch[1])
+    if usual[0] > _MAX_CONFUSED * usual[1]:
         return not_run(DRIVEN, what, "the drivers drive alike")
-    return shares_compared(DRIVEN, what, wrong(rows, own, stretch[0]), usual, -1.0, OTHER_DRIVER)
+    return shares_compared(
+        DRIVEN, what, count_wrong(rows, own, stretch[0]), usual, -1.0, OTHER_DRIVER
+    )
 
 
-def _stretches(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
+def _split_by_driver(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
     """Return each row's stretch (N,), of one driver in one episode, and each stretch's driver."""
     assert rows.driver is not None
     begins = np.append(True, (np.diff(rows.episode) != 0) | (rows.driver[1:] != rows.driver[:-1]))
     return np.cumsum(begins) - 1, rows.driver[begins]
 
 
-def _style(rows: FedRows) -> F64:
+def _driving_features(rows: FedRows) -> F64:
     """Return features (N, F) of how a row's driver responds to the plan and to obstacles."""
     speed, turn = (rows.command() / np.abs(rows.task.actions).max(axis=0).clip(1e-9)).T
     near = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
@@ -353,13 +355,13 @@ def _best_move(floor: Warehouse, places: F64) -> F64:
     return np.asarray(best)
 
 
-def _by_mission(values: F64, mission: np.ndarray, chosen: Bools) -> F64:
+def _mean_by_mission(values: F64, mission: np.ndarray, chosen: Bools) -> F64:
     """Return the mean of the values (M,) that are `chosen`, per mission."""
     number = np.unique(mission[chosen], return_inverse=True)[1].reshape(-1)
     return np.asarray(np.bincount(number, values[chosen]) / np.bincount(number))
 
 
-def _chosen(rows: FedRows) -> Iterator[Comparison]:
+def _check_outcomes(rows: FedRows) -> Iterator[Comparison]:
     """Compare the success of each condition's episodes with others in the same situations."""
     what = "success without the condition less success with it, in the same situations"
     if rows.held is None or rows.success is None:
@@ -375,13 +377,13 @@ def _chosen(rows: FedRows) -> Iterator[Comparison]:
     known = np.isfinite(success)
     for name in sorted(set().union(*conditions)):
         with_it = np.array([name in one for one in conditions]) & known
-        met = [
+        situations = [
             exposure
             for exposure in set().union(*exposures)
             if sum(exposure in exposures[i] for i in np.flatnonzero(with_it))
-            >= _MET * with_it.sum()
+            >= _MIN_EXPOSED * with_it.sum()
         ]
-        left = np.array([any(one in each for one in met) for each in exposures]) & known & ~with_it
+        left = np.array([any(one in e for one in situations) for e in exposures]) & known & ~with_it
         if min(with_it.sum(), left.sum()) >= _MIN_MISSIONS:
             made = shares_compared(
                 CHOSEN + name, what, (int(success[left].sum()), int(left.sum())),

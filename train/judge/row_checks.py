@@ -88,10 +88,10 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     ):  # fmt: skip
         note = of_end if check == "last next" else ""
         yield share_judged(check, what, int((off & of).sum()), int(of.sum()), MOST, note=note)
-    yield _repeated(rows, moving & ~same)
+    yield _check_repeated(rows, moving & ~same)
 
 
-def _repeated(rows: FedRows, moving: Bools) -> Comparison:
+def _check_repeated(rows: FedRows, moving: Bools) -> Comparison:
     """Count moving rows that equal another one byte for byte; noise is never the same twice."""
     both = np.concatenate([rows.observation, rows.next_observation], axis=1)[moving]
     again = len(both) - len(set(map(bytes, both)))
@@ -110,7 +110,7 @@ LOST = 0.05  # of the ends
 UNCAUSED = "terminated without cause"
 _JUMP_M = 0.9  # larger changes in one step mean that the plan was replaced
 _TOUCHING_M = 0.05
-_TELLING = 0.05  # a reward, or its error, above the noise of float32 and clearances
+_MIN_REWARD = 0.05  # a reward, or its error, above the noise of float32 and clearances
 _ARRIVED_M = 0.15  # plan left beyond the goal's radius: a plan is never shorter than the distance
 
 
@@ -156,14 +156,14 @@ def _progress(rows: FedRows) -> F64:
 
 def outcomes(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     """Check rewards, then terminations."""
-    yield from _rewards(logs, twin)
-    yield from _ends(logs, twin)
+    yield from _check_rewards(logs, twin)
+    yield from _check_terminations(logs, twin)
 
 
-def _rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
+def _check_rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     what = "reward against the task's own reward for the same observations"
     implied = implied_reward(logs)
-    telling = np.abs(implied) > _TELLING  # False for NaN
+    telling = np.abs(implied) > _MIN_REWARD  # False for NaN
     if len(np.unique(logs.cluster[telling])) < MIN_CLUSTERS:
         yield not_run(
             "reward scale", what, "too few rows whose reward follows from their observations"
@@ -178,23 +178,23 @@ def _rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
         least=1 / SCALE, most=SCALE, logs_rows=int(telling.sum()),
     )  # fmt: skip
     what = "row's reward is not the task's own, whatever its scale"
-    found = _unlike(logs, implied, scale.value)
+    found = _count_unlike(logs, implied, scale.value)
     if twin is None:
         yield share_judged("reward rows", what, *found, OTHER)
     else:
-        expected = _unlike(twin, implied_reward(twin), 1.0)
+        expected = _count_unlike(twin, implied_reward(twin), 1.0)
         yield shares_compared("reward rows", what, found, expected, -1.0, OTHER)
 
 
-def _unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
+def _count_unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
     """Count rows whose reward is not `implied` times `scale`, and rows with an implied reward."""
     known = np.isfinite(implied)
-    scale = scale if abs(scale) > _TELLING else 1.0
-    off = np.abs(rows.reward[known] / scale - implied[known]) > _TELLING
+    scale = scale if abs(scale) > _MIN_REWARD else 1.0
+    off = np.abs(rows.reward[known] / scale - implied[known]) > _MIN_REWARD
     return int(off.sum()), int(known.sum())
 
 
-def _ends(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
+def _check_terminations(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     weight, ends = logs.task.rewards, logs.terminated
     cause = arrived(logs) | (logs.reward > weight.goal / 2) | (logs.reward < weight.bump / 2)
     for check, what, off, of in (
@@ -262,12 +262,12 @@ def values(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     else:
         few = len(np.unique(logs.episode)) < MIN_CLUSTERS
         for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
-            for row in _entry(name, logs, twin, np.random.default_rng([0, 4])):
+            for row in _check_entry(name, logs, twin, np.random.default_rng([0, 4])):
                 yield replace(row, status="undecided") if few and row.off else row
     yield from _lidar(logs, twin, np.random.default_rng([0, 3]))
 
 
-def _entry(
+def _check_entry(
     name: str, logs: FedRows, twin: FedRows, rng: np.random.Generator
 ) -> Iterator[Comparison]:
     of_logs, of_twin = (
@@ -312,8 +312,8 @@ def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Ite
         yield not_run("lidar bearing", what, "the robot has no lidar")
         return
     task, width = logs.task, 360 / logs.task.sectors
-    found = _approach(logs, rng)
-    expected = _approach(twin, rng) if twin is not None else None
+    found = _measure_approach(logs, rng)
+    expected = _measure_approach(twin, rng) if twin is not None else None
     if expected is not None:
         shape = expected[0]
     else:
@@ -346,7 +346,7 @@ def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Ite
         )  # fmt: skip
 
 
-def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
+def _measure_approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     """Return how much nearer things come per metre driven, (1 + R, sectors); None if too few rows.
 
     Values are relative to the mean over sectors. The first row is of all clusters, the others are
@@ -389,16 +389,16 @@ def stored(
     Labels and terminations are checked in whole recordings, about `MAX_ROWS` rows in total.
     `conditions` are those of the profile that can be computed from the stored signals.
     """
-    yield _far_commands(store, rows)
-    recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
+    yield _check_commands(store, rows)
+    recordings, left_out = _choose_recordings(store, rows.task.hash, profile.labels_version)
     if not recordings:
         for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
             yield unflagged(check, what, left_out)
         return
     steps = logged_steps(store, rows.task.hash, recordings)
-    whole = _whole(steps)
-    yield from _labels(steps, whole, profile.shown_by_logs(conditions), left_out)
-    yield _terminations(steps, rows)
+    whole = _in_whole_episodes(steps)
+    yield from _check_labels(steps, whole, profile.shown_by_logs(conditions), left_out)
+    yield _check_stored_terminations(steps, rows)
 
 
 def fed_labels(store: Store, rows: FedRows) -> Iterator[Flags]:
@@ -419,7 +419,7 @@ def fed_labels(store: Store, rows: FedRows) -> Iterator[Flags]:
         )  # fmt: skip
 
 
-def _far_commands(store: Store, rows: FedRows) -> Flags:
+def _check_commands(store: Store, rows: FedRows) -> Flags:
     fed = pa.table({"transition_id": rows.transition_id})
     with passed_in(store.connection, fed=fed):
         found = store.connection.sql(
@@ -432,7 +432,7 @@ def _far_commands(store: Store, rows: FedRows) -> Flags:
     return Flags("far commands", what, found["transition_id"], off, COARSE)
 
 
-def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
+def _choose_recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
     """Return recordings with labels of this version, and a note if there are others."""
     found = store.connection.sql(
         "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
@@ -453,14 +453,14 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
     return chosen, note
 
 
-def _whole(steps: LoggedSteps) -> Bools:
+def _in_whole_episodes(steps: LoggedSteps) -> Bools:
     """Return whether each row (N,) is of an episode that is stored completely, with its end."""
     ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
     broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
     return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)
 
 
-def _labels(
+def _check_labels(
     steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
 ) -> Iterator[Flags]:
     if not whole.any():
@@ -496,7 +496,7 @@ def _labels(
         )  # fmt: skip
 
 
-def _terminations(steps: LoggedSteps, rows: FedRows) -> Flags:
+def _check_stored_terminations(steps: LoggedSteps, rows: FedRows) -> Flags:
     place = {number: index for index, number in enumerate(rows.transition_id.tolist())}
     at = np.array([place.get(number, -1) for number in steps.transition_id.tolist()], np.int64)
     known = steps.followed & (at >= 0)

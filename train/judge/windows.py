@@ -98,7 +98,7 @@ class Window:
         least = min(follows, default=0.0)
         doubts = {}
         for symptom in self.symptoms:
-            reasons = [*self._supply(symptom), *self._rows(symptom, least)]
+            reasons = [*self._supply_reasons(symptom), *self._row_reasons(symptom, least)]
             relative = self.relative(symptom)
             if relative is not None and symptom.gap is not None:
                 if symptom.gap >= LIMITS.gap and relative >= LIMITS.relative:
@@ -115,7 +115,7 @@ class Window:
                 doubts[symptom.condition] = reasons
         return doubts
 
-    def _supply(self, symptom: Symptom) -> list[str]:
+    def _supply_reasons(self, symptom: Symptom) -> list[str]:
         if symptom.supply is None:
             return [] if symptom.replay_share else ["is not in replay"]
         if symptom.supply >= LIMITS.supply:
@@ -123,7 +123,7 @@ class Window:
         share, observed = symptom.replay_share, symptom.met_share
         return [f"is {share:.2%} of replay and {observed:.1%} of the steps when driving"]
 
-    def _rows(self, symptom: Symptom, least: float) -> list[str]:
+    def _row_reasons(self, symptom: Symptom, least: float) -> list[str]:
         reasons = []
         if symptom.agreement is not None and symptom.agreement < LIMITS.agreement:
             reasons.append(

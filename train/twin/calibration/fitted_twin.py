@@ -264,13 +264,13 @@ def unidentified(
     width = uncertainty.half / solution.coordinates.useful
     for index in np.argsort(-width):
         if width[index] > 1:
-            kept = _kept_as_in_base(residuals, solution, uncertainty, int(index))
+            kept = _keep_at_base(residuals, solution, uncertainty, int(index))
             if kept is not None:
                 return kept
     return None
 
 
-def _kept_as_in_base(
+def _keep_at_base(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty, index: int
 ) -> ParameterEstimate | None:
     """Return a poorly identified parameter at base, with the reason; None if it is to be fitted."""

@@ -118,7 +118,7 @@ def log_segments(
     stride = horizon if stride_s is None else _periods(task, stride_s, "stride_s")
     warmup = int(np.ceil(warmup_s / task.control_period_s - 1e-9))
     period_ns = round(task.control_period_s * 1e9)
-    fresh = _fresh(steps, period_ns)
+    fresh = _find_fresh(steps, period_ns)
 
     first = np.flatnonzero(steps.begins)
     ends = np.append(first[1:], len(steps))
@@ -132,14 +132,14 @@ def log_segments(
             left["too short a stretch"] += end - begin
             continue
         left["warm-up"] += lead
-        even = _evenly(rows["stamp_ns"][base:end], horizon, period_ns)
+        even = _find_even(rows["stamp_ns"][base:end], horizon, period_ns)
         good = base + np.flatnonzero(even & fresh[base : end - horizon])
         while (following := int(np.searchsorted(good, place))) < len(good):
             start = int(good[following])
-            left += _passed_over(even[place - base : start - base])
+            left += _count_passed(even[place - base : start - base])
             starts.append(start)
             place = start + stride
-        left += _passed_over(even[place - base :])
+        left += _count_passed(even[place - base :])
         left["end of a stretch"] += max(end - max(place, end - horizon), 0)
     at = np.array(starts, np.int64)
     index = at[:, None] + np.arange(horizon + 1)
@@ -165,7 +165,7 @@ def log_segments(
     )
 
 
-def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
+def _find_even(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
     """Return whether `horizon` evenly spaced ticks follow each tick, (N - horizon,).
 
     `stamp_ns` (N,) are the times of one stretch of consecutive steps.
@@ -177,7 +177,7 @@ def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
     return np.asarray(even, np.bool_)
 
 
-def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
+def _count_passed(even: NDArray[np.bool_]) -> Counter[str]:
     """Count the reasons why no segment begins at these ticks (N,)."""
     return Counter(
         {
@@ -240,7 +240,7 @@ def split_at(
     return ticks[:, -1] <= at, ticks[:, 0] >= at
 
 
-def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
+def _find_fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
     """Return which rows' poses (N,) have about the median age of their recording."""
     age = steps.now["stamp_ns"] - steps.now["pose_stamp_ns"]
     fresh = np.zeros(len(age), np.bool_)

@@ -143,11 +143,11 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
             raise StoreError("no transitions", where=str(path), remedy="ingest recordings into it")
         there = [row for row in rows if row[1] and Path(row[1]).exists()]
         if recording is not None:
-            there = [_named(recording, rows, str(path))]
+            there = [_find_recording(recording, rows, str(path))]
         identity, source, toml, _ = (there or rows)[0]
         alike = [row for row in rows if row[2] == toml]
-        said = f"poses of the rows of {counted(len(alike), 'recording')}"
-        everywhere = _poses(store, [row[0] for row in alike], said)
+        source_text = f"poses of the rows of {counted(len(alike), 'recording')}"
+        everywhere = _poses(store, [row[0] for row in alike], source_text)
         profile = _stored_profile(toml, source)
         names = {row[0]: row[1] or row[0] for row in alike[:COMPARED] if row[0] != identity}
         task = None if profile is None else profile.task
@@ -163,7 +163,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
     return StoredDrive(poses, everywhere, file, profile, others, notes)
 
 
-def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
+def _find_recording(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
     """Return the row whose ID, file name or end of path is `recording`.
 
     Raises:
@@ -239,27 +239,27 @@ def gather(
         profile, notes = profile or stored.profile, stored.notes
         if stored.recording is None:
             known = None if map_yaml is None else (read_grid(map_yaml), str(map_yaml))
-            size = _of_profile(profile)
+            size = _profile_footprint(profile)
             return Evidence(stored.poses, known, size, notes=notes, others=stored.others)
         file = stored.recording
     with open_recording(file, definitions=definitions, salvage=True) as recording:
-        known = _map(recording, map_yaml, notes, needed=with_map)
+        known = _read_map(recording, map_yaml, notes, needed=with_map)
         free_on = _free_on(known)
         poses = own = choose_poses(candidate_poses(recording, profile), free_on)
-        if with_map and known and stored is not None and _lies_on(stored.everywhere, free_on):
+        if with_map and known and stored is not None and _is_on_map(stored.everywhere, free_on):
             poses = stored.everywhere  # all recordings lie on this map, so they share its frame
-        size = _of_profile(profile) or footprint_of(descriptions(recording))[0]
+        size = _profile_footprint(profile) or footprint_of(descriptions(recording))[0]
         scans: list[PlacedScans] = []
         if with_scans and own is not None:
             scans = placed_scans(recording, own, profile, size)
     return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.others)
 
 
-def _lies_on(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:
+def _is_on_map(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:
     return len(poses) > 0 and float(free_on(poses.places_m).mean()) >= WELL_PLACED
 
 
-def _map(
+def _read_map(
     recording: Recording, map_yaml: Path | None, notes: list[str], *, needed: bool
 ) -> tuple[OccupancyGrid, str] | None:
     try:
@@ -273,7 +273,7 @@ def _map(
         return None
 
 
-def _of_profile(profile: Profile | None) -> Footprint | None:
+def _profile_footprint(profile: Profile | None) -> Footprint | None:
     if profile is None:
         return None
     body = profile.task.body

@@ -78,7 +78,7 @@ def placed_scans(
     Header stamps come first, then log time, as the clocks of two computers may differ. The result
     is empty if there are no scans, or none can be placed.
     """
-    fit = _topic(recording, profile)
+    fit = _scan_topic(recording, profile)
     if fit is None:
         return []
     topic, kind = fit[0].name, fit[1]
@@ -87,7 +87,7 @@ def placed_scans(
     if not {ranges, *angles} <= leaves:
         return []
     paths = [path for path in (*angles, *_LIMITS, STAMP) if path in leaves]
-    read = recording.read({topic: paths}, {topic: Reduction((ranges,), partial(_thinned, ranges))})
+    read = recording.read({topic: paths}, {topic: Reduction((ranges,), partial(_thin, ranges))})
     columns = read.get(topic)
     if columns is None or not len(columns):
         return []
@@ -100,13 +100,13 @@ def placed_scans(
     times = Times.of(columns)
     clocks = [True, False] if shared_clock(poses.times, times) else [False]
     placed = [
-        _placed(columns, poses, topic, (turn, place), (first, last), notes, by_stamp=by_stamp)
+        _place_scans(columns, poses, topic, (turn, place), (first, last), notes, by_stamp=by_stamp)
         for by_stamp in clocks
     ]
     return [scans for scans in placed if len(scans)]
 
 
-def _placed(
+def _place_scans(
     columns: TopicColumns,
     poses: Poses,
     topic: str,
@@ -151,7 +151,7 @@ def _placed(
     return PlacedScans(origins, hits, order, f"scans of {topic} by {clock}", notes)
 
 
-def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Kind] | None:
+def _scan_topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Kind] | None:
     """Return the topic of the lidar's scans, and its type and fields; None if there is none."""
     if profile is not None:
         scan = profile.inputs.scan
@@ -163,7 +163,7 @@ def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Ki
     return min(found, key=lambda fit: "fake" in fit[0].name or "sim" in fit[0].name, default=None)
 
 
-def _thinned(path: str, fields: Fields) -> dict[str, FieldColumn]:
+def _thin(path: str, fields: Fields) -> dict[str, FieldColumn]:
     """Thin scans to fewer than 2 BEAMS beams; return ranges, beam indices and beam counts."""
     ranges = fields[path]
     rows = [np.asarray(ranges[row], np.float32).ravel() for row in range(len(ranges))]
@@ -401,20 +401,20 @@ def scan_map(
     Floor within `room_m` of the robot's path `driven_m` (N, 2) is free. The agreement is the share
     of beams that end within one cell of a wall.
     """
-    yaw = main_direction(*_walls(scans))
+    yaw = main_direction(*_wall_directions(scans))
     turned = (0.0, 0.0, yaw)
     origins = into_frame(scans.origin_m, turned)
     hits = [into_frame(hit, turned) for hit in scans.hit_m]
     driven = into_frame(way_between(driven_m), turned)
-    ends = [_cut(origin, hit)[0] for origin, hit in zip(origins, hits, strict=True)]
+    ends = [_cut_beams(origin, hit)[0] for origin, hit in zip(origins, hits, strict=True)]
     every = np.concatenate([origins, driven, *ends])
     low = every.min(axis=0) - 3 * CELL_M
     shape = tuple(np.ceil((every.max(axis=0) - low) / CELL_M).astype(int) + 3)
-    odds, ended = _traced(origins, hits, low, shape)
+    odds, ended = _trace(origins, hits, low, shape)
     occupancy = np.full(shape, UNKNOWN, np.int8)
     occupancy[odds <= FREE_BELOW] = FREE
     walls = odds >= OCCUPIED_ABOVE
-    walls &= ~_speckles(walls, occupancy, notes)
+    walls &= ~_remove_speckles(walls, occupancy, notes)
     occupancy[walls] = OCCUPIED
     way = np.zeros(shape, np.bool_)
     way[tuple(_cells(driven, low).T)] = True
@@ -426,7 +426,7 @@ def scan_map(
     return OccupancyGrid(occupancy, CELL_M, origin, frame), share
 
 
-def _walls(scans: PlacedScans) -> tuple[F64, F64]:
+def _wall_directions(scans: PlacedScans) -> tuple[F64, F64]:
     """Return the directions (rad) and lengths (m) of pieces of wall between the ends of beams."""
     steps = []
     for hit, beam in zip(scans.hit_m, scans.order, strict=True):
@@ -439,7 +439,7 @@ def _walls(scans: PlacedScans) -> tuple[F64, F64]:
     return np.arctan2(step[on_wall, 1], step[on_wall, 0]), length[on_wall]
 
 
-def _cut(origin: F64, hit: F64) -> tuple[F64, F64, Bools]:
+def _cut_beams(origin: F64, hit: F64) -> tuple[F64, F64, Bools]:
     """Cut beams at REACH_M; return their ends (B, 2), lengths (B,), and which were not cut (B,)."""
     along = hit - origin
     length = np.hypot(*along.T)
@@ -451,7 +451,7 @@ def _cells(places: F64, low: F64) -> Ints:
     return np.floor((places - low) / CELL_M).astype(np.int64)
 
 
-def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> tuple[F64, Ints]:
+def _trace(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> tuple[F64, Ints]:
     """Return the log-odds (X, Y) that cells are occupied, and how many scans ended in each cell."""
     odds = np.zeros(shape)
     flat, ended = odds.reshape(-1), np.zeros(odds.size, np.int64)
@@ -459,7 +459,7 @@ def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> 
     for origin, hit in zip(origins, hits, strict=True):
         if not len(hit):
             continue
-        ends, length, stops = _cut(origin, hit)
+        ends, length, stops = _cut_beams(origin, hit)
         at = np.arange(0.0, float(length.max()), 0.7 * CELL_M)
         beam, step = np.nonzero(at[None, :] < length[:, None] - CELL_M / 2)
         way = origin + (ends - origin)[beam] * (at[step] / length[beam])[:, None]
@@ -475,7 +475,7 @@ def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> 
     return odds, ended.reshape(shape)
 
 
-def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
+def _remove_speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
     """Free single wall cells in free floor, such as a person's legs; return their mask (X, Y)."""
     neighbours = ndimage.convolve(walls.astype(np.int8), np.ones((3, 3), np.int8), mode="constant")
     alone = walls & (neighbours == 1)

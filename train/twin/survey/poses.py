@@ -103,25 +103,25 @@ class Poses:
         )
 
 
-def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bools]:
+def interpolated(known_ns: Ints, values: F64, wanted_ns: Ints) -> tuple[F64, Bools]:
     """Interpolate values (N, K) at times (M,); also return which have a near sample on each side.
 
     Near means within `MAX_APART_NS`.
     """
     if not len(known_ns):
-        return np.zeros((len(asked_ns), values.shape[1])), np.zeros(len(asked_ns), np.bool_)
+        return np.zeros((len(wanted_ns), values.shape[1])), np.zeros(len(wanted_ns), np.bool_)
     order = np.argsort(known_ns, kind="stable")
     known, values = known_ns[order], values[order]
     first = np.flatnonzero(np.diff(known, prepend=known[0] - 1) > 0)
     known, values = known[first], values[first]
-    after = np.clip(np.searchsorted(known, asked_ns), 0, len(known) - 1)
+    after = np.clip(np.searchsorted(known, wanted_ns), 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     origin = known[0]
     found = np.stack(
-        [np.interp(asked_ns - origin, known - origin, column) for column in values.T], axis=-1
+        [np.interp(wanted_ns - origin, known - origin, column) for column in values.T], axis=-1
     )
-    near = np.abs(known[after] - asked_ns) <= MAX_APART_NS
-    near &= np.abs(asked_ns - known[before]) <= MAX_APART_NS
+    near = np.abs(known[after] - wanted_ns) <= MAX_APART_NS
+    near &= np.abs(wanted_ns - known[before]) <= MAX_APART_NS
     return found, near & np.isfinite(found).all(axis=1)
 
 
@@ -132,7 +132,7 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     pose topics (localised ones first), other transforms. Satellite fixes are the last resort.
     """
     if profile is not None:
-        at, (x_m, y_m) = _by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
+        at, (x_m, y_m) = _read_by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
         return [] if at is None else [replace(at, x_m=at.x_m - x_m, y_m=at.y_m - y_m)]
     guess = transform_frames(recording, transform_edges(recording))
     along = None
@@ -140,9 +140,9 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
         along = along_transforms(recording, guess)
     kinds = topics_for(recording, KINDS["pose"])
     fixes = {topic.name: kind.fields for topic, kind in kinds if kind.by_fix}
-    found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
+    found = _read_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
     if not found and along is None:  # fixes have a frame of their own, and no heading
-        found = [p for name, of in fixes.items() for p in [_by_fixes(recording, name, of)] if p]
+        found = [p for name, of in fixes.items() for p in [_read_fixes(recording, name, of)] if p]
     return [p for p in ((along, *found) if on_map(guess) else (*found, along)) if p is not None]
 
 
@@ -161,20 +161,20 @@ def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) ->
     return moving[int(np.argmax(shares))] if moving else None
 
 
-def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
+def _read_by_profile(recording: Recording, profile: Profile) -> Poses | None:
     source = profile.inputs.pose
     if source is not None and source.topic in recording.topics:
         if source.by_rates:
             return None
         if source.by_fix:
             settings = source.origin_deg, source.max_std_m, source.track_m
-            return _by_fixes(recording, source.topic, source.fields, *settings)
-        found = _of_topics(recording, {source.topic: source.fields})
+            return _read_fixes(recording, source.topic, source.fields, *settings)
+        found = _read_topics(recording, {source.topic: source.fields})
         return found[0] if found else None
     return None if profile.frames is None else along_transforms(recording, profile.frames)
 
 
-def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) -> list[Poses]:
+def _read_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) -> list[Poses]:
     """Read poses from topics with these fields; topics that lack a field are left out."""
     wanted: dict[str, list[str]] = {}
     for topic, fields in topics.items():
@@ -197,7 +197,7 @@ def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) ->
     return found
 
 
-def _by_fixes(
+def _read_fixes(
     recording: Recording,
     topic: str,
     fields: Mapping[str, str],

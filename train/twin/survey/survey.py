@@ -136,7 +136,7 @@ def survey(
     )
     body, notes = footprint or evidence.footprint, list(evidence.notes)
     poses = evidence.poses
-    how, grid, source = _grid(evidence, by, body, str(path), notes)
+    how, grid, source = _choose_grid(evidence, by, body, str(path), notes)
     body = body or STAND_IN
     made = floor_of_grid(
         grid,
@@ -157,7 +157,7 @@ def survey(
     return Surveyed(floor, made.grid, how, source, body, poses, notes, elsewhere)
 
 
-def _grid(
+def _choose_grid(
     evidence: Evidence, by: Source | None, body: Footprint | None, where: str, notes: list[str]
 ) -> tuple[Source, OccupancyGrid, str]:
     """Return the kind of source of the floor, its grid, and a text on the source."""
@@ -189,11 +189,11 @@ def _grid(
     usable = [scans for scans in evidence.scans if len(scans) >= MIN_SCANS]
     if usable:
         half_m = MIN_BODY_M / 2 if body is None else body.width_m / 2
-        grid, agree, source, said = _scanned(usable, poses, half_m + MARGIN_M)
+        grid, agree, source, scan_notes = _map_scans(usable, poses, half_m + MARGIN_M)
         if agree >= AGREEING or by == "scans":
-            notes += said
+            notes += scan_notes
             return "scans", grid, f"{source}, by {poses.source}"
-        notes.append(f"{said[-1]}: no map was made from them")
+        notes.append(f"{scan_notes[-1]}: no map was made from them")
     elif by == "scans":
         raise RecordingError(
             "contains no scans that can be used: no LaserScan, or no poses at their times",
@@ -206,7 +206,7 @@ def _grid(
     return "corridor", driven_corridor(poses, turn_m), f"the path driven, by {poses.source}"
 
 
-def _scanned(
+def _map_scans(
     usable: list[PlacedScans], poses: Poses, room_m: float
 ) -> tuple[OccupancyGrid, float, str, list[str]]:
     """Map the scans by header stamps, or by log time if they agree clearly better that way.
@@ -249,22 +249,23 @@ def _check_frames(
     on = grid.cells_at(poses.places_m)[1]
     off, walls = float((~on).mean()), float((on & (found > FREE)).mean())
     unknown = float((on & (found == UNKNOWN)).mean())
-    said = f"of {len(poses):,} {poses.source}, {off:.0%} are off the map, {walls:.0%} in walls" + (
-        f" and {unknown:.0%} where it is unknown" if unknown >= 0.005 else ""
+    shares = (
+        f"of {len(poses):,} {poses.source}, {off:.0%} are off the map, {walls:.0%} in walls"
+        + (f" and {unknown:.0%} where it is unknown" if unknown >= 0.005 else "")
     )
     frames = ""
     if grid.frame and poses.frame and grid.frame != poses.frame:
         frames = f"; the map is in frame {grid.frame!r}, the poses are in {poses.frame!r}"
     if off + walls + unknown > MAX_OFF:
         raise ConfigError(
-            f"{said}, and {int((found == FREE).sum()):,} on its free floor{frames}: the map does"
+            f"{shares}, and {int((found == FREE).sum()):,} on its free floor{frames}: the map does"
             " not belong to these poses",
             where=f"{where}, {source}",
             remedy="give the map that the robot localised in (--map map.yaml), or a --profile "
             "with a pose in the map's frame, or make the floor --by scans or --by corridor",
         )
     if off + walls + unknown >= 0.01 or frames:
-        notes.append(said + frames)
+        notes.append(shares + frames)
 
 
 def _check_walls(
@@ -277,17 +278,17 @@ def _check_walls(
     """
     by_clock = [returns_on_walls(one, grid) for one in scans]
     agree = max((share for share in by_clock if share is not None), default=1.0)
-    said = f"{agree:.0%} of the lidar's returns are on walls of the map"
+    share = f"{agree:.0%} of the lidar's returns are on walls of the map"
     if agree < MIN_ON_WALLS:
         raise ConfigError(
-            f"only {said}: it is not a map of this place, or the poses are in another frame",
+            f"only {share}: it is not a map of this place, or the poses are in another frame",
             where=f"{where}, {source}",
             remedy="give the map that the robot localised in (--map map.yaml), or a --profile "
             "with a pose in the map's frame, or make the floor --by scans (--by map uses this map "
             "without this check)",
         )
     if agree < SEEN:
-        notes.append(f"only {said}: the poses are imprecise, or the place has changed since")
+        notes.append(f"only {share}: the poses are imprecise, or the place has changed since")
 
 
 MIN_SIDE_M = 2.0  # smaller floors are not divided into quarters
