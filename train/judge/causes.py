@@ -36,7 +36,7 @@ from restock.train.judge.mission_checks import CHOSEN
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
 GOALS = "GOALS_OF_OTHERS"
-_FIRST = (  # no other check of rows means anything until these are mended
+_FIRST = (  # if one is found, other checks of rows mean nothing
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
 # Checks of a signal's values. If several are off, the first explains the others.

@@ -54,7 +54,7 @@ DOCUMENT, EPISODES = "gate.json", "episodes.parquet"
 ERROR = 0.05  # of the whole verdict
 FIRST_SEED = 1_000_000  # far from the seeds of evaluations
 ROUND = 32  # pairs of a kind that are driven between two checks of what is decided
-MAX_MISSIONS = 3  # budgets that a kind may drive: one with several cells needs more than one
+MAX_MISSIONS = 3  # a kind of mission may drive this many budgets, as it may have several cells
 
 
 @dataclass(frozen=True)

@@ -41,17 +41,17 @@ class DiagnosisLimits:
     """Limits beyond which a figure is a symptom."""
 
     gap: float = 3.0  # G_k of a condition; O_k if the condition is not in replay
-    relative: float = 3.0  # G_k over the median G; both limits must be passed
+    relative: float = 3.0  # G_k over the median G; both limits must be exceeded
     gap_everywhere: float = 6.0  # the median G: everything is worse held out
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is effectively no target network
-    clock: float = 2.0  # S
+    clock: float = 2.0  # S: the networks disagree
     returns: float = 3.0  # |Q| over the largest return of an episode, whose rewards may cancel
     explained: float = 0.2  # of the targets' variance; a critic below it has learnt nothing
-    supply: float = 0.1  # a condition's share of replay over its share of driving, at least
-    agreement: float = 0.1  # of a condition's logged rows that look like fresh ones, at least
+    supply: float = 0.1  # least share of replay over the share of driving, of a condition
+    agreement: float = 0.1  # least share of a condition's logged rows that look like fresh ones
     unexplained: float = 1.0  # of the next observations' variance; 1: their mean explains as much
-    unexplained_relative: float = 1.6  # the same over the condition with the least; both must pass
+    unexplained_relative: float = 1.6  # over the condition with the least; both limits count
 
 
 LIMITS = DiagnosisLimits()

@@ -95,7 +95,7 @@ def placed_scans(
     frame = scans_of(recording, [fit])[topic].frame
     turn, place = _mount(recording, frame, profile, footprint, notes)
     first, last = (np.asarray(columns.fields[path], np.float64) for path in angles)
-    if "angle_max_rad" in kind.fields:  # the type has no angle increment
+    if "angle_max_rad" in kind.fields:  # `last` is a bearing, not the increment
         last = (last - first) / np.maximum(np.asarray(columns.fields["count"]) - 1, 1)
     times = Times.of(columns)
     clocks = [True, False] if shared_clock(poses.times, times) else [False]
