@@ -78,7 +78,7 @@ def read_description(text: str) -> Description | str:
         robot = ET.fromstring(text)  # no entities: checked above
     except (ET.ParseError, ValueError) as error:
         return f"is not XML ({error})"
-    if any(_of_xacro(element) for element in robot.iter()):
+    if any(_is_xacro(element) for element in robot.iter()):
         return "is a xacro file, not a URDF: convert it first (`xacro FILE > robot.urdf`)"
     if robot.tag != "robot":
         return f"is not a URDF: it begins with <{robot.tag}>, not with <robot>"
@@ -98,19 +98,19 @@ def read_description(text: str) -> Description | str:
         placed = {joint.child for joint in joints}
         roots = [name for name in links if name not in placed]
         if len(roots) != 1:
-            return _no_base(roots)
+            return _describe_no_base(roots)
         base = roots[0]
     return Description(str(robot.get("name") or "robot"), links, joints, base, robot)
 
 
-def _of_xacro(element: ET.Element) -> bool:
+def _is_xacro(element: ET.Element) -> bool:
     """Return whether an element must still be expanded by xacro."""
     values = element.attrib.values()
     in_namespace = element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]
     return in_namespace or any("${" in value or "$(" in value for value in values)
 
 
-def _no_base(roots: list[str]) -> str:
+def _describe_no_base(roots: list[str]) -> str:
     """Describe why no link can be the base."""
     why = "every link hangs on another"
     if roots:

@@ -70,7 +70,7 @@ from restock.ingest.task.conditions import (
     of_kind,
     reported,
     shipped,
-    unseen,
+    signals_named,
     with_files,
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
@@ -118,19 +118,19 @@ class Profile(Checked, frozen=True, dict=True):
     @property
     def conditions(self) -> list[Condition]:
         """Return the outcomes that label this robot's steps."""
-        return self._of("outcome", self.shipped_conditions)
+        return self._conditions_of("outcome", self.shipped_conditions)
 
     @property
     def exposures(self) -> list[Condition]:
         """Return the exposures that label this robot's steps."""
-        return self._of("exposure", self.shipped_exposures)
+        return self._conditions_of("exposure", self.shipped_exposures)
 
     @property
     def constants(self) -> dict[str, float]:
         """Return the constants that the SQL of conditions may name beside the columns of steps."""
         return self.noise.constants | self.task.condition_limits
 
-    def _of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
+    def _conditions_of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
         known = shipped(self.constants, kind)
         own = of_kind(self.own_conditions, kind)
         constants = self.constants
@@ -157,7 +157,7 @@ class Profile(Checked, frozen=True, dict=True):
         It leaves out the conditions and their [noise], as rows can be relabelled without the
         recordings and have a `labels_version`; the [tags]; and what only the twin needs.
         """
-        values = _given(msgspec.to_builtins(self))
+        values = _without_none(msgspec.to_builtins(self))
         rest = {key: value for key, value in values.items() if key not in _NOT_IN_ROWS}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
@@ -321,7 +321,7 @@ def without_lidar(profile: Profile) -> Profile:
 
 def profile_toml(profile: Profile) -> str:
     """Format the profile as TOML with every default; `parse_profile` returns an equal profile."""
-    values = _given(msgspec.to_builtins(profile))
+    values = _without_none(msgspec.to_builtins(profile))
     plain, tables = [], []
     for name, value in values.items():
         if isinstance(value, dict):
@@ -346,11 +346,11 @@ def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profil
     )
 
 
-def _given(value: Any) -> Any:
+def _without_none(value: Any) -> Any:
     """Return built-in values without None: TOML has no null, and None is always the default."""
     if isinstance(value, dict):
-        return {key: _given(item) for key, item in value.items() if item is not None}
-    return [_given(item) for item in value] if isinstance(value, list | tuple) else value
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return [_without_none(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _lines(table: dict[str, Any]) -> list[str]:
@@ -534,7 +534,7 @@ def _check_conditions(profile: Profile, where: str) -> None:
     own = own_sql(task, "reward_terms") if task.reward_terms else []
     own += own_sql(task, "observed") if task.observed else []
     if profile.goal_source == "hindsight":
-        for name, plan in unseen(own, PLAN_SIGNALS).items():
+        for name, plan in signals_named(own, PLAN_SIGNALS).items():
             what = f"the SQL of {name!r} in [task] names {plan[0]}, and {DRIVEN_PLAN}"
             raise ConfigError(what, where=where, remedy="leave it out: nothing stood on it")
     try:

@@ -54,9 +54,9 @@ class PathProblem(Exception):
 
 def element_of(path: str) -> tuple[str, int | None]:
     """Split the path of an element into field and index; the index of a whole field is None."""
-    bare = path.partition(IN)[0]
-    match = _ELEMENT.fullmatch(bare)
-    return (match[1], int(match[2])) if match else (bare, None)
+    field = path.partition(IN)[0]
+    match = _ELEMENT.fullmatch(field)
+    return (match[1], int(match[2])) if match else (field, None)
 
 
 def factor_of(key: str, path: str) -> float | None:
@@ -164,21 +164,21 @@ class SignalPath:
             if field.many
         }
         for place in range(len(self.steps)):
-            step, bare = self.steps[place], ".".join(s.name for s in self.steps[: place + 1])
-            if step.choice is not None and bare not in repeats:
-                if any(_bare(path) == bare or _bare(path).startswith(bare + ".") for path in kinds):
+            step, field_path = self.steps[place], ".".join(s.name for s in self.steps[: place + 1])
+            if step.choice is not None and field_path not in repeats:
+                if any((_unbracketed(path) + ".").startswith(field_path + ".") for path in kinds):
                     raise PathProblem(f"{step.name} does not repeat: write it without brackets")
-            elif step.choice is None and bare in repeats:
+            elif step.choice is None and field_path in repeats:
                 raise PathProblem(
                     f"{step.name} repeats: write {step.name}[0] for one element, or {step.name}[] "
                     "for the list of all"
                 )
         for path in self.wanted(*ends):
             if path not in kinds:
-                raise PathProblem(offer(path, list(kinds)))
+                raise PathProblem(suggest_fields(path, list(kinds)))
         for place, path in self.beside().items():
             choice = self.steps[place].choice
-            if choice and (_bare(path) in repeats) == (choice.key is not None):
+            if choice and (_unbracketed(path) in repeats) == (choice.key is not None):
                 raise PathProblem(
                     f"{path!r} cannot select an element: it does not have one value per element"
                 )
@@ -281,9 +281,9 @@ def _chosen(
         return np.flatnonzero(inside)
     assert beside is not None
     if choice.key is not None:
-        return _first(np.flatnonzero(_says(np.asarray(beside), which)), parent)
+        return _first(np.flatnonzero(_equals(np.asarray(beside), which)), parent)
     owner, place, names = _open(beside)
-    named = _first(np.flatnonzero(_says(np.asarray(names), which)), owner)
+    named = _first(np.flatnonzero(_equals(np.asarray(names), which)), owner)
     wanted = np.full(parents, -1)
     wanted[owner[named]] = place[named]
     return np.flatnonzero(position == wanted[parent])
@@ -295,7 +295,7 @@ def _bound(bound: int | None, lengths: Rows, otherwise: Any) -> Any:
     return bound if bound >= 0 else np.maximum(lengths + bound, 0)
 
 
-def _says(values: NDArray[Any], text: str) -> NDArray[np.bool_]:
+def _equals(values: NDArray[Any], text: str) -> NDArray[np.bool_]:
     if values.dtype.kind in "OU":
         return np.asarray(values == text, np.bool_)
     try:
@@ -309,15 +309,15 @@ def _first(rows: Rows, parent: Rows) -> Rows:
     return rows[np.unique(parent[rows], return_index=True)[1]]
 
 
-def _bare(path: str) -> str:
+def _unbracketed(path: str) -> str:
     return path.replace("[]", "")
 
 
-def offer(path: str, paths: list[str]) -> str:
+def suggest_fields(path: str, paths: list[str]) -> str:
     """Return an error text for a missing field path that suggests similar paths."""
-    bare = {_bare(known): known for known in paths}
+    unbracketed = {_unbracketed(known): known for known in paths}
     ends = {known.split(".")[-1]: known for known in paths}
-    near = [bare[name] for name in get_close_matches(_bare(path), bare, n=3)]
+    near = [unbracketed[name] for name in get_close_matches(_unbracketed(path), unbracketed, n=3)]
     near = near or [ends[name] for name in get_close_matches(path.split(".")[-1], ends, n=3)]
     problem = f"no field {path!r}"
     if near:
@@ -330,20 +330,20 @@ def offer(path: str, paths: list[str]) -> str:
 class Convention:
     """A way in which messages of one type mark values that were not measured.
 
-    `read` takes values (V,) and, for each of the fields `said_by`, its values (V,) in the same
+    `read` takes values (V,) and, for each of the fields `marked_by`, its values (V,) in the same
     messages. It returns the values with NaN for those that were not measured.
     """
 
     type: str  # last part of the type, as JSON and protobuf types have other package names
     values: tuple[str, ...]  # fields that it applies to, with all fields below them
-    said_by: tuple[str, ...]  # fields that mark a value as not measured
+    marked_by: tuple[str, ...]  # fields that mark a value as not measured
     read: Callable[..., F64]
     words: str  # how a value is marked, for messages to the user
 
     @property
     def fields(self) -> list[str]:
-        """Return the field paths to decode for `said_by`."""
-        return [element_of(path)[0] for path in self.said_by]
+        """Return the field paths to decode for `marked_by`."""
+        return [element_of(path)[0] for path in self.marked_by]
 
     @property
     def of_messages(self) -> bool:
@@ -352,8 +352,8 @@ class Convention:
 
     def flags(self, columns: Mapping[str, FieldColumn]) -> Bools:
         """Return which messages (N,) mark their `values` as not measured."""
-        said = [said_in(columns, path) for path in self.said_by]
-        return np.asarray(np.isnan(self.read(np.zeros(len(said[0])), *said)), np.bool_)
+        markings = [read_element(columns, path) for path in self.marked_by]
+        return np.asarray(np.isnan(self.read(np.zeros(len(markings[0])), *markings)), np.bool_)
 
 
 def _unless_minus_one(values: F64, variance: F64) -> F64:
@@ -423,17 +423,17 @@ def conventions_of(kind: str, path: str, fields: Collection[str] | None = None) 
 
     With `fields`, only those whose marking fields are among the messages' `fields`.
     """
-    bare = re.sub(r"\[[^\]]*\]", "", path.partition(IN)[0])
+    field_path = re.sub(r"\[[^\]]*\]", "", path.partition(IN)[0])
     return [
         one
         for one in CONVENTIONS
         if one.type == last_part(kind)
-        and any(bare == value or bare.startswith(f"{value}.") for value in one.values)
+        and any(field_path == value or field_path.startswith(f"{value}.") for value in one.values)
         and (fields is None or set(one.fields) <= set(fields))
     ]
 
 
-def said_in(columns: Mapping[str, FieldColumn], path: str) -> F64:
+def read_element(columns: Mapping[str, FieldColumn], path: str) -> F64:
     """Return a field of each message, or an element of a list, (N,); NaN if the list is shorter."""
     path, place = element_of(path)
     column = columns[path]

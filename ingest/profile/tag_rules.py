@@ -82,8 +82,8 @@ def in_words(tags: Mapping[str, str]) -> str:
 
 
 # Metadata of a recording: the source's name for messages, the record's name, and its entries.
-Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"
-_TABLE = "`[tags]` of the profile"
+Metadata: TypeAlias = "tuple[str, str, Mapping[str, str]]"
+_TAGS_TABLE = "`[tags]` of the profile"
 
 
 class TagRules(Checked, frozen=True):
@@ -128,14 +128,14 @@ class TagRules(Checked, frozen=True):
             return {}
         listed = " nor ".join(map(repr, self.patterns))
         raise RecordingError(
-            f"its path does not match {listed}, the from_path in {_TABLE}",
+            f"its path does not match {listed}, the from_path in {_TAGS_TABLE}",
             where=place,
             remedy='correct the pattern, add one for such paths (from_path = ["…", "…"]), or give'
             f" {' '.join(f'--tag {name}=…' for name in sorted(requested))}",
         )
 
     def of_metadata(
-        self, said: Sequence[Said], given: Collection[str], where: str
+        self, metadata: Sequence[Metadata], given: Collection[str], where: str
     ) -> tuple[dict[str, dict[str, str]], list[str]]:
         """Return the tags in a recording's metadata, keyed by their source, and notes.
 
@@ -143,7 +143,7 @@ class TagRules(Checked, frozen=True):
             RecordingError: the metadata has two values of a tag that is not `given`.
         """
         found: dict[str, list[tuple[str, str, str]]] = {}  # value, source, record
-        for source, record, entries in said:
+        for source, record, entries in metadata:
             for key, value in entries.items():
                 for name in self._names(record, key):
                     if value.strip() and name not in given:
@@ -191,7 +191,7 @@ class RecordingTags:
 def resolve_tags(
     rules: TagRules,
     path: Path,
-    said: Sequence[Said],
+    metadata: Sequence[Metadata],
     given: Mapping[str, str],
     before: Mapping[str, str],
 ) -> RecordingTags:
@@ -208,7 +208,7 @@ def resolve_tags(
         RecordingError: two sources disagree, or no pattern matches the path, and `given` does not
             decide.
     """
-    own, notes = rules.of_metadata(said, given, str(path))
+    own, notes = rules.of_metadata(metadata, given, str(path))
     tags: dict[str, tuple[str, str]] = {}
     for source, entries in (own | rules.of_path(path, given)).items():
         for name, value in entries.items():
@@ -257,11 +257,11 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
             " {robot}/*"
         )
     begin = "/" if pattern.startswith("/") else "/(?:.*/)?"
-    folders = ("(?:[^/]+/)*" if part == "**" else _of_part(part) + "/" for part in parts[:-1])
-    return re.compile(begin + "".join(folders) + _of_part(parts[-1]))
+    folders = ("(?:[^/]+/)*" if part == "**" else _part_pattern(part) + "/" for part in parts[:-1])
+    return re.compile(begin + "".join(folders) + _part_pattern(parts[-1]))
 
 
-def _of_part(part: str) -> str:
+def _part_pattern(part: str) -> str:
     """Return the regular expression for one part of a path; it matches no empty part."""
     wild = {"*": "[^/]*", "?": "[^/]"}
     pieces = (

@@ -33,7 +33,7 @@ from restock.ingest.propose.roles import (
 from restock.ingest.propose.trial import Advice, Trial
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.task.conditions import shipped, unseen
+from restock.ingest.task.conditions import shipped, signals_named
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Noise, Rewards, Task
 
@@ -134,7 +134,7 @@ def advice_of(seen: Evidence) -> Iterator[Advice]:
         )
     if not roles["scan"]:
         known = shipped()
-        names = ", ".join(unseen([known[name] for name in _conditions(seen)[0]]))
+        names = ", ".join(signals_named([known[name] for name in _conditions(seen)[0]]))
         yield Advice("conditions", f"no lidar: {names} are unknown (neither true nor false)")
         if (cloud := _cloud(seen)) is not None:
             yield Advice(

@@ -20,7 +20,7 @@ from restock.ingest.profile.signal_paths import (
     PathProblem,
     PathValues,
     conventions_of,
-    said_in,
+    read_element,
 )
 from restock.ingest.profile.tables import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
 from restock.ingest.steps.align import LatestMessages
@@ -149,8 +149,8 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
 
 def _measured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
     """Replace values by NaN that messages mark as not measured."""
-    said = (said_in(columns, path)[read.message] for path in rule.said_by)
-    return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *said))
+    markings = (read_element(columns, path)[read.message] for path in rule.marked_by)
+    return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *markings))
 
 
 def _key(name: str) -> str:

@@ -39,7 +39,7 @@ from restock.ingest.profile.signal_paths import (
     frame_path,
     plain,
     pressed_in,
-    said_in,
+    read_element,
 )
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS
@@ -137,9 +137,9 @@ def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None =
             column = rows
         if isinstance(column, np.ndarray):
             named[key] = np.asarray(column, np.float64)
-    said = {key: named.get(key) for key in ("status", "covariance_m2", "covariance_type")}
+    quality = {key: named.get(key) for key in ("status", "covariance_m2", "covariance_type")}
     latitude, longitude = named["latitude_deg"], named["longitude_deg"]
-    return Fixes(columns.log_time_ns, latitude, longitude, **said, yaw_rad=yaw)
+    return Fixes(columns.log_time_ns, latitude, longitude, **quality, yaw_rad=yaw)
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class InputColumns:
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
-        return fields[path] if place is None else said_in(fields, source.fields[key])
+        return fields[path] if place is None else read_element(fields, source.fields[key])
 
     def numbers(self, name: str, key: str) -> F64:
         """Return a field of an input in the unit of its key, one number per message, (N,)."""

@@ -26,9 +26,9 @@ from restock.ingest.profile.signal_paths import (
     element_of,
     frame_id_path,
     frame_path,
-    offer,
     plain,
     pressed_paths,
+    suggest_fields,
     transform_fields,
 )
 from restock.ingest.profile.tables import CLOUD, SCANS, CustomSignal, Input
@@ -317,7 +317,7 @@ def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Le
     has = {leaf.path.removesuffix("[]") for leaf in leaves}
     key = name if "." in name else f"inputs.{name}"
     return [
-        f"`{key}.fields`: {source.topic}: {offer(path, sorted(has))}"
+        f"`{key}.fields`: {source.topic}: {suggest_fields(path, sorted(has))}"
         for path in field_paths(source)
         if path.removesuffix("[]") not in has
     ]

@@ -39,8 +39,8 @@ from restock.ingest.task.conditions import (
     Condition,
     held,
     primary,
+    signals_named,
     unknown_rows,
-    unseen,
 )
 from restock.ingest.task.schema import true_names
 from restock.ingest.task.task import OUTLINE_SIGNALS
@@ -115,7 +115,7 @@ def uncertain_conditions(profile: Profile) -> list[str]:
     """Return the conditions and exposures whose labels depend on a guessed robot outline."""
     if profile.robot is None or not profile.robot.outline_guessed:
         return []
-    return sorted(unseen(profile.shown_by_logs(profile.definitions), OUTLINE_SIGNALS))
+    return sorted(signals_named(profile.shown_by_logs(profile.definitions), OUTLINE_SIGNALS))
 
 
 def driven_plan(rows: pa.Table) -> bool:

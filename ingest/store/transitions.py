@@ -22,7 +22,7 @@ from restock.ingest.task.conditions import (
     Condition,
     label_several,
     primary,
-    too_near_to_call,
+    uncertain_steps,
 )
 from restock.ingest.task.schema import (
     PROVENANCE,
@@ -380,7 +380,7 @@ def label_columns(
         "condition": [named[row] for row in rows] if named else [NOMINAL] * len(rows),
         "conditions": names_of(labels, rows),
         "probabilities": by_name(probabilities, rows),
-        "uncertain": names_of(too_near_to_call(probabilities, conditions), rows),
+        "uncertain": names_of(uncertain_steps(probabilities, conditions), rows),
         "exposures": names_of(exposures, rows),
     }
 

@@ -48,13 +48,13 @@ _GROWING = {
     "bitstring",
 }
 _MORE_ROWS = {"unnest", "unlist"}
-_OF_X = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
-_WINDOWED = {*_OF_X, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
+_UNARY = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
+_WINDOWED = {*_UNARY, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
 # Functions that use a time zone: it is an argument, or the session's, which is fixed here.
-_OF_ZONES = {"timezone", "make_timestamptz"}
+_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
 # Aggregates that depend on the order of the rows; window functions do in any case.
-_OF_ORDER = {
+_ORDERED = {
     *("any_value", "arbitrary", "list", "array_agg"),
     *("string_agg", "group_concat", "listagg"),
 }
@@ -109,7 +109,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
     node = statements[0]["node"]
     if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
         return "it is more than one expression"
-    if not _plain_query(node):
+    if not _is_own_query(node):
         return _UNBALANCED
     for part in _walk(node["select_list"][0]):
         if reason := _refuse(part, timing):
@@ -117,7 +117,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
     return None
 
 
-def _plain_query(node: dict[str, Any]) -> bool:
+def _is_own_query(node: dict[str, Any]) -> bool:
     """Return whether the parsed query around the expression still is `SELECT`."""
     source = node["from_table"]
     return (
@@ -154,10 +154,10 @@ def _refuse(part: dict[str, Any], timing: str) -> str | None:
         return f"{part['function_name']}() makes several rows of one: it is not allowed here"
     if kind == "FUNCTION" and part["function_name"].lower() in _WINDOWED:
         name = part["function_name"].lower()
-        return f"{name}() needs a window: write `{name}({'x' * (name in _OF_X)}) OVER episode`"
-    if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
+        return f"{name}() needs a window: write `{name}({'x' * (name in _UNARY)}) OVER episode`"
+    if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _impure():
         return f"{part['function_name']}() reads data other than the steps: it is not allowed here"
-    if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():
+    if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _impure():
         return f"{part['column_names'][-1]} reads data other than the steps: it is not allowed here"
     return _refuse_window(part, timing) if kind == "WINDOW" else None
 
@@ -239,7 +239,7 @@ def _constant(part: dict[str, Any] | None) -> bool:
 
 
 @cache
-def _outside() -> frozenset[str]:
+def _impure() -> frozenset[str]:
     """Return the names of functions whose result depends on more than their arguments.
 
     `+` and `date_trunc` of a time with a zone depend on the session's zone. It is fixed here, so
@@ -250,14 +250,14 @@ def _outside() -> frozenset[str]:
             "SELECT function_name FROM duckdb_functions() WHERE function_type = 'macro'"
         ).fetchall()
     return (
-        _changing()
+        _volatile()
         | {"age", "error"}  # age() of a single time depends on today
         | {name for (name,) in macros if not name.startswith(_MACROS) and name not in _MORE_MACROS}
     )
 
 
 @cache
-def _changing() -> frozenset[str]:
+def _volatile() -> frozenset[str]:
     """Return the names of functions that may return another value when called again."""
     with sandbox().cursor() as connection:
         rows = connection.sql(
@@ -273,7 +273,7 @@ def _changing() -> frozenset[str]:
 
 
 @lru_cache(maxsize=1024)
-def not_an_expression(sql: str) -> str | None:
+def expression_problem(sql: str) -> str | None:
     """Return why this SQL is not one expression that can be put into brackets, or None."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
@@ -288,10 +288,10 @@ def not_an_expression(sql: str) -> str | None:
 
 
 @lru_cache(maxsize=1024)
-def not_repeatable(sql: str) -> str | None:
+def repeatability_problem(sql: str) -> str | None:
     """Return what makes an expression differ between runs on the same rows, or None.
 
-    Also None for SQL that cannot be parsed: `not_an_expression` refuses that.
+    Also None for SQL that cannot be parsed: `expression_problem` refuses that.
     """
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR)"
@@ -303,16 +303,16 @@ def not_repeatable(sql: str) -> str | None:
             name = part["column_names"][0].lower()
             if not name.startswith("current_"):
                 continue
-        if name in _changing() - _OF_ZONES or (name == "age" and len(part["arguments"]) == 1):
+        if name in _volatile() - _ZONES or (name == "age" and len(part["arguments"]) == 1):
             return f"{name}() may differ from one time to the next"
-        if kind == "WINDOW" and not part["orders"] and _follows_order(part):
+        if kind == "WINDOW" and not part["orders"] and _depends_on_order(part):
             return f"{name}() OVER (…) without ORDER BY depends on the order in which rows are read"
     return None
 
 
-def _follows_order(window: dict[str, Any]) -> bool:
+def _depends_on_order(window: dict[str, Any]) -> bool:
     """Return whether a window without ORDER BY depends on the order of the rows."""
     if any(window[edge].endswith("_ROWS") for edge in ("start", "end")):
         return True
-    of_order = window["type"] != "WINDOW_AGGREGATE" or window["function_name"].lower() in _OF_ORDER
-    return of_order and not window["arg_orders"]  # first(x ORDER BY y)
+    ordered = window["type"] != "WINDOW_AGGREGATE" or window["function_name"].lower() in _ORDERED
+    return ordered and not window["arg_orders"]  # first(x ORDER BY y)

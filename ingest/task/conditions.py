@@ -112,15 +112,15 @@ class Condition(Checked, frozen=True):
         The condition's own constants take precedence. If `constants` has `control_period_s`, times
         such as `{1.6 s}` and distances such as `{0.2 m}` are replaced by numbers of steps.
         """
-        words, made = self.words, dict[str, Any]()
+        words, replaced = self.words, dict[str, Any]()
         used = {name: value for name, value in constants.items() if name in words}
         if "control_period_s" in constants:
-            made = {
+            replaced = {
                 "sql": in_steps(self.sql, constants),
                 "probability": in_steps(self.probability, constants),
                 "let": {name: in_steps(sql, constants) for name, sql in self.let.items()},
             }
-        return msgspec.structs.replace(self, constants=used | self.constants, **made)
+        return msgspec.structs.replace(self, constants=used | self.constants, **replaced)
 
     @property
     def words(self) -> set[str]:
@@ -170,7 +170,7 @@ def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Conditio
     return [msgspec.structs.replace(condition, kind=kind) for condition in read]
 
 
-def unseen(
+def signals_named(
     conditions: Iterable[Condition], signals: Collection[str] = LIDAR_SIGNALS
 ) -> dict[str, list[str]]:
     """Return the conditions that name any of these signals, and the signals that each names.
@@ -196,7 +196,7 @@ def unknown_rows(
         (lidar, LIDAR_SIGNALS, NO_LIDAR),
     ):
         if not known:
-            lost = unseen(definitions, signals)
+            lost = signals_named(definitions, signals)
             unknown |= {name: (named, because) for name, named in lost.items()}
     return [
         {
@@ -222,7 +222,7 @@ def reported(
 
 def labels_version(conditions: Sequence[Condition]) -> str:
     """Return a hash of a set of conditions, 12 hex digits."""
-    said = [
+    definitions = [
         (c.name, c.timing, c.sql, c.priority)
         # Optional settings are hashed only if used, so that the version of a plain rule stays.
         + ((c.probability, c.uncertain) if c.probability else ())
@@ -230,7 +230,7 @@ def labels_version(conditions: Sequence[Condition]) -> str:
         + ((c.kind,) if c.kind != "outcome" else ())
         for c in conditions
     ]
-    content = msgspec.json.encode(sorted(said, key=str))
+    content = msgspec.json.encode(sorted(definitions, key=str))
     return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
@@ -360,7 +360,7 @@ def _numbers(column: Column, where: str) -> F64:
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 
-def too_near_to_call(
+def uncertain_steps(
     probable: Mapping[str, F32], conditions: Sequence[Condition]
 ) -> dict[str, Bools]:
     """Return at which steps each condition's probability lies within its `uncertain` band, (N,)."""
@@ -409,13 +409,13 @@ def _evaluate(
                             connection, [(condition, part)], len(steps), limit_s / len(requested)
                         )
                     except duckdb.Error as error:
-                        _say_why(error, steps, _where(condition, part), limit_s)
+                        _raise_reason(error, steps, _where(condition, part), limit_s)
                 names = ", ".join(repr(condition.name) for condition, _ in several)
-                _say_why(together_error, steps, f"the conditions {names}", limit_s)
+                _raise_reason(together_error, steps, f"the conditions {names}", limit_s)
     return columns
 
 
-def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -> NoReturn:
+def _raise_reason(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -> NoReturn:
     """Raise DuckDB's error about a condition's SQL as a ConfigError."""
     import duckdb
 
@@ -457,8 +457,8 @@ def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> 
 
 
 def _where(condition: Condition, which: Expression) -> str:
-    said = f"condition {condition.name!r}"
-    return said if which == "sql" else f"the probability of {said}"
+    name = f"condition {condition.name!r}"
+    return name if which == "sql" else f"the probability of {name}"
 
 
 def _source(condition: Condition) -> str:
@@ -572,16 +572,16 @@ def shipped(
     stand-in robot, with the default noise of profiles.
     """
     constants = constants or Noise().constants | STAND_IN_LIMITS
-    return {one.name: one for one in of_kind(_of_robot(tuple(constants.items())), kind)}
+    return {one.name: one for one in of_kind(_with_robot_constants(tuple(constants.items())), kind)}
 
 
 @lru_cache(maxsize=64)
-def _of_robot(constants: tuple[tuple[str, float], ...]) -> list[Condition]:
-    return [one.with_constants(dict(constants)) for one in _as_shipped()]
+def _with_robot_constants(constants: tuple[tuple[str, float], ...]) -> list[Condition]:
+    return [one.with_constants(dict(constants)) for one in _read_shipped()]
 
 
 @cache
-def _as_shipped() -> list[Condition]:
+def _read_shipped() -> list[Condition]:
     """Read the shipped conditions of both kinds, sorted by name, without a robot's constants."""
     folder = files("restock.ingest.task") / "conditions"
     texts = {
@@ -615,12 +615,12 @@ def settings_of(text: str) -> dict[str, Any]:
             else:
                 doc.append(line[2:].strip())
     sql = {name: "\n".join(lines).strip() for name, lines in (parts | lets).items()}
-    said: dict[str, Any] = {"sql": sql.get("label", ""), "doc": " ".join(doc)}
+    values: dict[str, Any] = {"sql": sql.get("label", ""), "doc": " ".join(doc)}
     if lets:
-        said["let"] = {name: sql[name] for name in lets}
+        values["let"] = {name: sql[name] for name in lets}
     if "probability" in parts:
-        said["probability"] = sql["probability"]
-    return said | settings
+        values["probability"] = sql["probability"]
+    return values | settings
 
 
 def _value(text: str) -> str | int | list[str | float]:

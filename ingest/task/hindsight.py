@@ -98,7 +98,7 @@ def missions(
             mission lies within one leg.
     """
     at = np.flatnonzero(located)
-    found = _Cutting(rules, task, xy_m[at], stamp_ns[at], leg[at]).missions()
+    found = _MissionCutter(rules, task, xy_m[at], stamp_ns[at], leg[at]).missions()
     # Ticks without a position get the mission of the tick before.
     before = np.searchsorted(at, np.arange(len(stamp_ns)), "right") - 1
     mission = np.where(before >= 0, np.append(found.mission, -1)[before], -1)
@@ -106,7 +106,7 @@ def missions(
     return replace(found, mission=mission, standing=standing)
 
 
-class _Cutting:
+class _MissionCutter:
     """Cuts a drive into missions, leg by leg; within a leg the robot was not carried."""
 
     def __init__(self, rules: GoalRules, task: Task, xy_m: F64, stamp_ns: Ints, leg: Ints) -> None:
@@ -226,13 +226,13 @@ class _Cutting:
 
 def driven_m(xy_m: F64, leg: Ints, band_m: float) -> float:
     """Return the distance driven, in steps of more than `band_m`, so that noise does not count."""
-    driven, here = 0.0, (math.nan, math.nan, -1)
+    driven, last = 0.0, (math.nan, math.nan, -1)
     for x, y, number in zip(xy_m[:, 0].tolist(), xy_m[:, 1].tolist(), leg.tolist(), strict=True):
-        step = math.hypot(x - here[0], y - here[1])
-        if number != here[2]:
-            here = (x, y, number)
+        step = math.hypot(x - last[0], y - last[1])
+        if number != last[2]:
+            last = (x, y, number)
         elif step > band_m:
-            driven, here = driven + step, (x, y, number)
+            driven, last = driven + step, (x, y, number)
     return driven
 
 
@@ -241,10 +241,10 @@ def route_of(driven_m: F64, goal_m: F64, spacing_m: float) -> F64:
 
     If the path comes back to a point, the loop between is left out.
     """
-    points, here = [driven_m[0]], 0
-    while here < len(driven_m) - 1:
-        near = np.hypot(*(driven_m[here:] - driven_m[here]).T) <= spacing_m
-        here += int(np.flatnonzero(near)[-1]) + 1
-        if here < len(driven_m):
-            points.append(driven_m[here])
+    points, index = [driven_m[0]], 0
+    while index < len(driven_m) - 1:
+        near = np.hypot(*(driven_m[index:] - driven_m[index]).T) <= spacing_m
+        index += int(np.flatnonzero(near)[-1]) + 1
+        if index < len(driven_m):
+            points.append(driven_m[index])
     return np.array([*points, goal_m])

@@ -217,12 +217,12 @@ def view_route(
     least = distance2.min(axis=1, keepdims=True)
     nearest = np.argmax(distance2 <= least + ROUNDING * (least + 0.1), axis=1)  # (N,), the first
     rows = np.arange(len(plans_m))
-    here = arc[rows, nearest] + along[rows, nearest] * length[rows, nearest]
+    position = arc[rows, nearest] + along[rows, nearest] * length[rows, nearest]
     total = arc[:, -1]
 
     body = np.empty((len(plans_m), len(distances_m), 2))
     for column, ahead in enumerate(distances_m):
-        target = np.minimum(here + ahead, total)
+        target = np.minimum(position + ahead, total)
         # The last vertex at or before the target, then the rest of the way along its segment.
         vertex = np.count_nonzero(arc[:, 1:] < target[:, None], axis=1)
         vertex = np.minimum(vertex, step_x.shape[1] - 1)
@@ -232,7 +232,7 @@ def view_route(
         ahead_y = start_y[rows, vertex] + part * step_y[rows, vertex] - pose_y_m
         body[:, column, 0] = cos * ahead_x + sin * ahead_y
         body[:, column, 1] = -sin * ahead_x + cos * ahead_y
-    return RouteView(body, total - here, np.sqrt(distance2[rows, nearest]))
+    return RouteView(body, total - position, np.sqrt(distance2[rows, nearest]))
 
 
 def _view_compiled(

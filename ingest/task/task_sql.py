@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.condition_sql import names_in, steps_back
-from restock.ingest.task.conditions import NO_LIDAR, Condition, numbers, unseen
+from restock.ingest.task.conditions import NO_LIDAR, Condition, numbers, signals_named
 from restock.ingest.task.schema import SIGNAL_COLUMNS, signal_arrays, steps_schema
 from restock.ingest.task.task import OWN_LIMIT, Signals, Task
 from restock.state import Stateful
@@ -57,25 +57,25 @@ def own_values(task: Task, table: Table, steps: pa.Table) -> dict[str, F64]:
         return ConfigError(what, where=f"`task.{table}.{name}`", remedy=remedy)
 
     own = own_sql(task, table)
-    for name, signals in ({} if task.lidar else unseen(own)).items():
+    for name, signals in ({} if task.lidar else signals_named(own)).items():
         raise refused(name, f"its SQL names {signals[0]}, and there is {NO_LIDAR}", "leave it out")
     try:
         values = numbers(steps, own)
     except ConfigError as error:
         raise refused((error.where or "").split("'")[1], error.what, error.remedy) from error
-    for one in own:
-        if early := sorted(_COMMANDS & names_in(one.sql)):
+    for term in own:
+        if early := sorted(_COMMANDS & names_in(term.sql)):
             what = f"its SQL names {early[0]}, which is chosen only after the step"
-            raise refused(one.name, what, "use the measured motion, such as wheel_speed_mps")
-        if table == "observed" and steps_back(one.sql) is None:
+            raise refused(term.name, what, "use the measured motion, such as wheel_speed_mps")
+        if table == "observed" and steps_back(term.sql) is None:
             what = "its SQL looks back without limit, and a running robot cannot"
             remedy = "begin its frame at a number of steps: ROWS BETWEEN {2 s} PRECEDING AND …"
-            raise refused(one.name, what, remedy)
-        if table == "observed" and re.search(r"\b(step|episode)_index\b", one.sql):
+            raise refused(term.name, what, remedy)
+        if table == "observed" and re.search(r"\b(step|episode)_index\b", term.sql):
             what = "its SQL names the step or episode, which a running robot does not number"
-            raise refused(one.name, what, "use the signals alone")
-        if len(wrong := values[one.name][np.abs(values[one.name]) > MAX_VALUE]):
-            raise refused(one.name, f"it is {wrong[0]:.4g} at a step", "bound it with least()")
+            raise refused(term.name, what, "use the signals alone")
+        if len(wrong := values[term.name][np.abs(values[term.name]) > MAX_VALUE]):
+            raise refused(term.name, f"it is {wrong[0]:.4g} at a step", "bound it with least()")
     return {name: np.nan_to_num(value) for name, value in values.items()}
 
 
@@ -114,30 +114,30 @@ def observed_in_log(
     if at is None:
         tick, of, last = np.arange(len(run)), run, np.arange(len(run))
     else:
-        near = at[:, None] + np.arange(-_longest(task, "observed"), 1)  # (n, steps kept)
+        near = at[:, None] + np.arange(-_max_steps_back(task, "observed"), 1)  # (n, steps kept)
         of, place = np.nonzero((near >= 0) & (run[near] == run[at][:, None]))
         tick, last = near[of, place], np.flatnonzero(place == near.shape[1] - 1)
-    columns = {name: signals[name][tick] for name in _named(task, "observed")}
+    columns = {name: signals[name][tick] for name in _named_signals(task, "observed")}
     if now is not None:
         for name, column in columns.items():
             column[last] = now[name]
-    return own_observation(task, _steps(columns, of, tick))[last]
+    return own_observation(task, _steps_table(columns, of, tick))[last]
 
 
-def _longest(task: Task, table: Table) -> int:
+def _max_steps_back(task: Task, table: Table) -> int:
     """Return how many steps the SQL of a table looks back, at most `time_limit_steps`."""
     back = [steps_back(one.sql) for one in own_sql(task, table)]
     most = task.time_limit_steps
     return min(max(most if steps is None else steps for steps in back), most)
 
 
-def _named(task: Task, table: Table) -> dict[str, pa.DataType]:
+def _named_signals(task: Task, table: Table) -> dict[str, pa.DataType]:
     """Return the signals that the SQL of a table names, with their types in the store."""
     named = {name for one in own_sql(task, table) for name in names_in(one.sql)}
     return {column.name: column.type for column in SIGNAL_COLUMNS if column.name in named}
 
 
-def _steps(columns: Signals, episode: Ints, step: Ints) -> pa.Table:
+def _steps_table(columns: Signals, episode: Ints, step: Ints) -> pa.Table:
     types = {column.name: column.type for column in SIGNAL_COLUMNS}
     arrays = {n: a.cast(types[n], safe=False) for n, a in signal_arrays(columns).items()}
     return pa.table({"episode_index": episode, "step_index": step} | arrays)
@@ -165,10 +165,10 @@ class Past(Stateful):
                 where=error.where,
                 remedy=f"{error.remedy}; or leave it out of the profile, and ingest again",
             ) from error
-        self._kept = _longest(task, table) + 1
+        self._kept = _max_steps_back(task, table) + 1
         self.columns: dict[str, NDArray[Any]] = {  # (N, steps kept), the newest last
             name: np.zeros((robots, self._kept), kind.to_pandas_dtype())
-            for name, kind in _named(task, table).items()
+            for name, kind in _named_signals(task, table).items()
         }
         self.steps = np.zeros(robots, np.int64)  # number of each robot's step in its episode
 
@@ -190,7 +190,7 @@ class Past(Stateful):
         step = self.steps[ids, None] + np.arange(1 - self._kept, 1)  # (n, steps kept)
         robot, place = np.nonzero(step >= 0)
         known = {name: column[ids[robot], place] for name, column in self.columns.items()}
-        steps = _steps(known, robot, step[robot, place])
+        steps = _steps_table(known, robot, step[robot, place])
         compute = own_reward if self._table == "reward_terms" else own_observation
         found: F32 = compute(self._task, steps)[place == self._kept - 1]
         return found

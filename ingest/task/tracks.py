@@ -317,11 +317,11 @@ class Tracker(Stateful):
         order = np.argsort(away[track, thing], kind="stable")
         taken, used = set[int](), set[int]()
         pairs = []
-        for one, other in zip(track[order].tolist(), thing[order].tolist(), strict=True):
-            if one not in taken and other not in used:
-                taken.add(one)
-                used.add(other)
-                pairs.append((one, other))
+        for row, detection in zip(track[order].tolist(), thing[order].tolist(), strict=True):
+            if row not in taken and detection not in used:
+                taken.add(row)
+                used.add(detection)
+                pairs.append((row, detection))
         if pairs:
             rows, things = np.array(pairs).T
             self._correct(rows, found, things)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from restock.arrays import Bools, Codes, Ints
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
 from restock.errors import uncertain_labels as uncertain_text
-from restock.ingest.task.condition_sql import not_an_expression, not_repeatable
+from restock.ingest.task.condition_sql import expression_problem, repeatability_problem
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.strata import ResolvedStratum
@@ -194,9 +194,9 @@ def read_candidates(
             state = (f"stratum {stratum.name!r}", stratum.state_predicate)
             predicates[f"state_{index}"] = state
     for place, sql in predicates.values():
-        if reason := not_an_expression(sql):
+        if reason := expression_problem(sql):
             raise ConfigError(reason, where=f"mixture, {place}")
-        if reason := not_repeatable(sql):
+        if reason := repeatability_problem(sql):
             raise ConfigError(
                 f"its SQL could choose other rows when it is mixed again: {reason}",
                 where=f"mixture, {place}",

@@ -27,7 +27,7 @@ from restock.ingest.task.conditions import (
     probabilities,
     settings_of,
     shipped,
-    too_near_to_call,
+    uncertain_steps,
 )
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.task import STAND_IN_LIMITS, Noise
@@ -415,7 +415,7 @@ def test_parts_of_a_condition_file():
     given = probabilities(table, [fast])["fast"]
     assert np.isnan(given[0])
     np.testing.assert_allclose(given[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
-    near = too_near_to_call({"fast": given}, [fast])["fast"]
+    near = uncertain_steps({"fast": given}, [fast])["fast"]
     assert near.tolist() == [False, False, True, True, False]
 
 
