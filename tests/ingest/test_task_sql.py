@@ -201,7 +201,7 @@ def test_sql_that_cannot_be_is_refused_by_name(table, given, what):
 
 def test_what_a_task_observes_of_its_own_is_not_mirrored():
     own = parse_profile(WAREHOUSE + ENTRIES, where="own.toml").task
-    with pytest.raises(ValueError, match="in a mirror"):
+    with pytest.raises(ValueError, match="mirror image"):
         Mirror.of(own)
 
 
