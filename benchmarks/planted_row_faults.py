@@ -92,8 +92,8 @@ def planting(fault: Fault, rng: Draws) -> type[Filling]:
     """Return a `Filling` that plants the fault before routes are looked up, or at the end."""
 
     class Planted(Filling):
-        def _scans(self) -> None:
-            super()._scans()
+        def _fill_scans(self) -> None:
+            super()._fill_scans()
             if fault.signals is not None:
                 fault.signals(self, rng)
 

@@ -40,7 +40,7 @@ from restock.ingest.containers.storage import Watch
 from restock.ingest.profile.profile import Profile, parse_profile, profile_toml
 from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_tags
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
-from restock.ingest.steps.episodes import Steps, split, steps_of, why_none
+from restock.ingest.steps.episodes import Steps, explain_no_transitions, split, steps_of
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs, unknown_directions
 from restock.ingest.store.lineage import Ingest, own_path
 from restock.ingest.store.manifest import (
@@ -258,7 +258,7 @@ class _Ingest:
         watch, ticks = self.recording.watch, len(steps)
         episodes = split(profile.task, steps)
         if not episodes.transitions:
-            why, remedy = why_none(steps, episodes)
+            why, remedy = explain_no_transitions(steps, episodes)
             raise RecordingError(
                 f"gives no transition with the profile {self.profile.name!r}: {why}",
                 remedy=remedy

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
-from restock.ingest.profile.profile import Profile, not_live
+from restock.ingest.profile.profile import Profile, live_problems
 from restock.ingest.profile.signal_paths import conventions_of, element_of
 from restock.ingest.profile.tables import Input
 from restock.ingest.steps.align import NS, ClockSegment, Samples
@@ -107,11 +107,11 @@ class LiveObserver:
             accept them, as in a recording, whose log time may come from another computer.
 
     Raises:
-        ConfigError: the profile uses something that is `not_live`.
+        ConfigError: the profile uses something that is `live_problems`.
     """
 
     def __init__(self, profile: Profile, max_ahead_s: float | None = None) -> None:
-        if lacking := not_live(profile):
+        if lacking := live_problems(profile):
             raise ConfigError(
                 f"takes {' and '.join(lacking)}",
                 where=f"profile {profile.name!r}",

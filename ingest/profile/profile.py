@@ -357,7 +357,7 @@ def _lines(table: dict[str, Any]) -> list[str]:
     return [f"{name} = {toml_value(value)}" for name, value in table.items()]
 
 
-def not_live(profile: Profile) -> dict[str, str]:
+def live_problems(profile: Profile) -> dict[str, str]:
     """Return what prevents a profile from running live: each problem, with what to do instead.
 
     Empty if the profile can run live.

@@ -200,7 +200,7 @@ def resolve_tags(
     Args:
         rules: the rules of its profile.
         path: its path.
-        said: its metadata.
+        metadata: its own metadata.
         given: tags from the command line, which override all others; an empty value removes a tag.
         before: its tags in the store; a tag that no source mentions any more is kept.
 

@@ -15,7 +15,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.consistency import Finding
-from restock.ingest.steps.episodes import Split, Steps, split, steps_of, why_none
+from restock.ingest.steps.episodes import Split, Steps, explain_no_transitions, split, steps_of
 from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
 
@@ -65,7 +65,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     except RecordingError as error:
         return Trial(problem=f"{error.what}; {error.remedy}" if error.remedy else error.what)
     episodes = split(profile.task, steps)
-    why, remedy = why_none(steps, episodes)
+    why, remedy = explain_no_transitions(steps, episodes)
     why = f"{why}; {remedy}" if remedy else why
     if not len(steps):
         return Trial(problem=why)

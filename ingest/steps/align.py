@@ -147,7 +147,7 @@ def align(
     """
     report = ClockReport(clock.alignment)
     segments: list[ClockSegment] = []
-    parts = _laps(topics)
+    parts = _split_laps(topics)
     for rows in parts:
         part = {name: _part(one, rows[name]) for name, one in topics.items()} if rows else topics
         for segment in _align(part, clock, latched, transforms, commands, tolerance_s, report):
@@ -163,7 +163,7 @@ def align(
     return segments, report
 
 
-def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
+def _split_laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
     """Split each topic's messages at the points where the recorder's clock was set back.
 
     At such a point, log time goes back on every frequent topic by about the same time, to before
@@ -177,7 +177,7 @@ def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]
         gone_ns = []
         for name in laps:
             of = topics[name].lap
-            before, after = (topics[name].log_time_ns[of == lap + late] for late in (0, 1))
+            before, after = (topics[name].log_time_ns[of == lap + step] for step in (0, 1))
             if not len(before) or not len(after):
                 return [{}]
             gone_ns.append(int(before.max() - after.min()))
@@ -215,7 +215,7 @@ def _align(
         simulated = None
     every = np.arange(max(map(len, topics.values()), default=0))  # shared by all topics
     if clock.alignment == "log_time":
-        samples = {name: _ordered(c.log_time_ns, every[: len(c)]) for name, c in topics.items()}
+        samples = {name: _sort(c.log_time_ns, every[: len(c)]) for name, c in topics.items()}
         return [ClockSegment(samples, ClockMap.constant(0))]
     stamped = stamped_topics(topics, latched | transforms)
     if not stamped:
@@ -234,7 +234,7 @@ def _align(
     drifts = _Drifts(round(tolerance_s * NS), simulated, report)
     segments = []
     for index in range(len(edges) + 1):
-        inside = {name: _during(edges, index, columns) for name, columns in topics.items()}
+        inside = {name: _rows_in(edges, index, columns) for name, columns in topics.items()}
         clock_map, middle = drifts.map_of(topics, stamped, reference, inside, edges, index)
         drifts.place_commands(topics, commands - stamped.keys(), inside, clock_map)
         segments.append(
@@ -344,14 +344,14 @@ def _edges(columns: TopicColumns, jump_ns: int) -> Ints:
     return np.asarray(edges[edges > columns.log_time_ns.min()], np.int64)
 
 
-def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
+def _rows_in(edges: Ints, index: int, columns: TopicColumns) -> Rows:
     """Return the rows of a topic's messages that were received in segment `index`."""
     if not len(edges):
         return slice(0, len(columns))
     return np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
 
 
-def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
+def _sort(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
     """Return samples in stamp order, sharing memory if they are in that order already."""
     if (stamp_ns[1:] < stamp_ns[:-1]).any():
         order = np.argsort(stamp_ns, kind="stable")  # among equal stamps, the last received wins
@@ -379,9 +379,9 @@ class _Drifts:
         """Return the map of one segment, and the reference topic's median delay in it."""
         jump_ns, rows = round(JUMP_S * NS), inside[reference]
         log = stamped[reference].log_time_ns[rows]
-        late = delay_ns(stamped[reference], rows)
-        middle = median(late)
-        if drift_ns(log, late) <= self.tolerance_ns:
+        delay = delay_ns(stamped[reference], rows)
+        middle = median(delay)
+        if drift_ns(log, delay) <= self.tolerance_ns:
             medians = [middle]
             for name in stamped.keys() - {reference}:
                 if len(delay := delay_ns(stamped[name], inside[name])):
@@ -389,14 +389,14 @@ class _Drifts:
             # Latency only adds to the clocks' offset, so the topic with the least delay is best.
             offset = min(each for each in medians if abs(each - middle) <= jump_ns)
             return ClockMap.constant(offset), middle
-        source, knots = reference, (log, late)
+        source, knots = reference, (log, delay)
         if self.simulated is not None:
             times = self.simulated.log_time_ns
             behind = times - np.asarray(self.simulated.fields[CLOCK_FIELD], np.int64)
             during = np.searchsorted(edges, times, "right") == index
             if during.sum() > 1:
                 by_clock = ClockMap.of_delays(times[during], behind[during])
-                if abs(median(by_clock.stamped(log) - (log - late))) <= jump_ns:
+                if abs(median(by_clock.stamped(log) - (log - delay))) <= jump_ns:
                     source, knots = CLOCK_TOPIC, (times[during], behind[during])
         fitted = ClockMap.of_delays(*knots)
         spread = spread_ns(residual_ns(knots[0], knots[0] - knots[1]))
@@ -415,8 +415,8 @@ class _Drifts:
         for name, columns in stamped.items():
             log = columns.log_time_ns[inside[name]]
             if len(log):
-                late = delay_ns(columns, inside[name])
-                ahead.append(median(log - late - fitted.stamped(log)))
+                delay = delay_ns(columns, inside[name])
+                ahead.append(median(log - delay - fitted.stamped(log)))
         shift = max((each for each in ahead if abs(each) <= jump_ns), default=0)
         report = self.report
         report.mapped_by = source
@@ -460,7 +460,7 @@ def _segment(
         columns, numbers = topics[name], every[rows]
         log_time = columns.log_time_ns[rows]
         if STAMP not in columns.fields or name in report.by_reception:
-            samples[name] = _ordered(clock_map.stamped(log_time), numbers)
+            samples[name] = _sort(clock_map.stamped(log_time), numbers)
             continue
         stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
         if name in transforms:
@@ -476,7 +476,7 @@ def _segment(
         elif off.any():
             report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
             stamp, numbers = stamp[~off], numbers[~off]
-        samples[name] = _ordered(stamp, numbers)
+        samples[name] = _sort(stamp, numbers)
     return ClockSegment(samples, clock_map)
 
 

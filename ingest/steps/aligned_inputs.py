@@ -143,7 +143,7 @@ class AlignedInputs:
         ]
         for segment in self.segments:
             given = segment.topics[topic]
-            said_ns = np.full(len(given.row), np.iinfo(np.int64).min)
+            latest_ns = np.full(len(given.row), np.iinfo(np.int64).min)
             for policy, name, source in sources:
                 last = segment.topics[source.topic].hold(given.stamp_ns, source.max_age_s)
                 if "pressed" in source.fields:
@@ -154,8 +154,8 @@ class AlignedInputs:
                     its = np.stack([self.inputs.numbers(name, key)[last.row] for key in keys])
                     same = (np.abs(its - command[:, given.row]) <= SAME_COMMAND).all(axis=0)
                     at_ns = given.stamp_ns - last.age_ns
-                    drives = last.fresh & same & (at_ns > said_ns)
-                    said_ns[drives] = at_ns[drives]
+                    drives = last.fresh & same & (at_ns > latest_ns)
+                    latest_ns[drives] = at_ns[drives]
                 by[given.row[drives]] = policy
         if through is None:
             return [by[row] for row in self.latest("command").row]
@@ -241,10 +241,10 @@ def _command_topics(inputs: InputColumns) -> frozenset[str]:
     """Return topics read only for commands, which take effect when they are received."""
     topics: dict[bool, set[str]] = {True: set(), False: set()}
     for name, source in inputs.by_name.items():
-        asks = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
+        commands = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
             f"{COMMAND_SOURCES}."
         )
-        topics[asks].add(source.topic)
+        topics[commands].add(source.topic)
     return frozenset(topics[True] - topics[False])
 
 

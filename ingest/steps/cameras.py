@@ -70,8 +70,8 @@ class ImageLayout:
     big_endian: bool = False
 
 
-def compressed_layout(data: bytes, said: str) -> ImageLayout:
-    """Read the layout of a JPEG or PNG file from its header; `said` is the message's format.
+def compressed_layout(data: bytes, message_format: str) -> ImageLayout:
+    """Read the layout of a JPEG or PNG file from its header; `message_format` is for errors.
 
     Raises:
         ImageProblem: the file is neither, its header is damaged, or its end is missing.
@@ -83,8 +83,8 @@ def compressed_layout(data: bytes, said: str) -> ImageLayout:
     elif not data:
         raise ImageProblem("no bytes")
     else:
-        raise ImageProblem(f"neither JPEG nor PNG (its format says {said[:60]!r})")
-    _bound(layout)
+        raise ImageProblem(f"neither JPEG nor PNG (its format says {message_format[:60]!r})")
+    _check_size(layout)
     return layout
 
 
@@ -101,7 +101,7 @@ def raw_layout(
     kind, channels, _ = ENCODINGS[encoding]
     bits = np.dtype(kind).itemsize * 8
     layout = ImageLayout(encoding, width, height, channels, bits, row_bytes, big_endian)
-    _bound(layout)
+    _check_size(layout)
     if row_bytes < width * channels * bits // 8:
         raise ImageProblem("rows shorter than their width")
     if size_bytes < row_bytes * height:
@@ -118,7 +118,7 @@ def pixels(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
         ImageProblem: the bytes are damaged, or do not have this layout.
     """
     if layout.encoding in (JPEG, PNG):
-        return _decoded(data, layout)
+        return _decode(data, layout)
     kind, channels, order = ENCODINGS[layout.encoding]
     size = layout.row_bytes * layout.height
     if len(data) < size:
@@ -130,7 +130,7 @@ def pixels(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
     return image[:, :, 0] if channels == 1 else np.ascontiguousarray(image[:, :, list(order)])
 
 
-def _decoded(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
+def _decode(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -146,7 +146,7 @@ def _decoded(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
     return array.astype(np.uint16) if array.dtype.kind == "i" else array
 
 
-def _bound(layout: ImageLayout) -> None:
+def _check_size(layout: ImageLayout) -> None:
     if layout.width < 1 or layout.height < 1:
         raise ImageProblem("no pixels")
     if layout.width * layout.height > MAX_PIXELS:
@@ -200,7 +200,7 @@ def image_fields(kind: str) -> tuple[str, ...]:
     return _COMPRESSED_FIELDS if kind == COMPRESSED else _RAW_FIELDS
 
 
-def other_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
+def wrong_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
     """Return the first field that is missing or differs from ROS's definition of this type.
 
     None if there is no such field.
@@ -240,8 +240,8 @@ def frame_reduction(kind: str) -> Reduction:
                 continue
             hashes[row] = np.frombuffer(hashlib.sha256(data).digest(), np.uint8)
             encoding[row] = one.encoding
-            said = (one.width, one.height, one.channels, one.bits, one.row_bytes, one.big_endian)
-            for name, value in zip(_NUMBERS[1:], said, strict=True):
+            values = (one.width, one.height, one.channels, one.bits, one.row_bytes, one.big_endian)
+            for name, value in zip(_NUMBERS[1:], values, strict=True):
                 numbers[name][row] = value
         return {**numbers, ENCODING: encoding, PROBLEM: problem, SHA256: hashes}
 

@@ -247,14 +247,14 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
         cause = "another sign, or another frame"
     elif high >= 1 / APART and low <= APART:
         return []
-    said = f"{what} {size} that of the poses of {pose_topic}"
-    said += f", in {len(ratio)} stretches of {WINDOW_S:g} s"
+    text = f"{what} {size} that of the poses of {pose_topic}"
+    text += f", in {len(ratio)} stretches of {WINDOW_S:g} s"
     remedy = {
         "wheels": "take the speeds from the poses ([motion] instead of [inputs.wheels]), or"
         " correct what publishes it",
         "gyro": "leave out [inputs.imu], or correct what publishes it",
     }[kind]
-    return [Finding(kind, topic, said, steps, cause, remedy)]
+    return [Finding(kind, topic, text, steps, cause, remedy)]
 
 
 def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
@@ -301,8 +301,10 @@ def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
 def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:
     """Find motion that is stamped before the command that caused it."""
     for name in ("speed_mps", "yaw_rate_radps"):
-        requested, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
-        by_lag, most = _by_lag(requested, did, drive.joined, period_s)
+        requested, motion = (
+            np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel")
+        )
+        by_lag, most = _by_lag(requested, motion, drive.joined, period_s)
         best = int(np.argmax(by_lag))
         lead = most - best  # steps by which the motion is early
         # One step is no evidence: a command may be sent when the motion of its step is over.
@@ -322,26 +324,26 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
     return []
 
 
-def _by_lag(requested: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
+def _by_lag(requested: F64, motion: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
     """Return `_correlation` at each lag from -n to n steps, and n, which is MAX_LEAD_S in steps."""
     most = max(1, round(MAX_LEAD_S / period_s))
-    return [_correlation(requested, did, joined, lag) for lag in range(-most, most + 1)], most
+    return [_correlation(requested, motion, joined, lag) for lag in range(-most, most + 1)], most
 
 
-def _correlation(requested: F64, did: F64, joined: Bools, lag: int) -> float:
+def _correlation(requested: F64, motion: F64, joined: Bools, lag: int) -> float:
     """Return the correlation of a command (T,) with the motion (T,) `lag` steps later.
 
     -1 if there are too few steps, or one of the two hardly varies.
     """
     if lag > 0:
-        requested, did, joined = requested[:-lag], did[lag:], joined[:-lag] & joined[lag:]
+        requested, motion, joined = requested[:-lag], motion[lag:], joined[:-lag] & joined[lag:]
     elif lag < 0:
-        requested, did, joined = requested[-lag:], did[:lag], joined[-lag:] & joined[:lag]
-    several = np.asarray([requested[joined], did[joined]], np.float64)  # (2, N)
-    if several.shape[1] < MIN_FOLLOWED:
+        requested, motion, joined = requested[-lag:], motion[:lag], joined[-lag:] & joined[:lag]
+    pair = np.asarray([requested[joined], motion[joined]], np.float64)  # (2, N)
+    if pair.shape[1] < MIN_FOLLOWED:
         return -1.0
-    several -= several.mean(axis=1, keepdims=True)
-    (own, shared), (_, other) = (several @ several.T).tolist()
-    if min(own, other) < 1e-6 * several.shape[1]:  # a standard deviation of 1e-3
+    pair -= pair.mean(axis=1, keepdims=True)
+    (own, shared), (_, other) = (pair @ pair.T).tolist()
+    if min(own, other) < 1e-6 * pair.shape[1]:  # a standard deviation of 1e-3
         return -1.0
     return float(shared / np.sqrt(own * other))

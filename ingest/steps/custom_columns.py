@@ -132,12 +132,12 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
         ) from None
     if signal.reduce != "count":
         for rule in conventions_of(signal.type, signal.path, columns):
-            read = _measured(rule, columns, read)
+            read = _mask_unmeasured(rule, columns, read)
             gone = np.bincount(read.message, np.isnan(read.values), count)
             every = np.bincount(read.message, minlength=count)
             texts[f"{_key(name)}, not measured"] = (every > 0) & (gone == every)
     if signal.reduce in ("min", "max", "mean", "sum"):
-        read = _reduced(read, signal.reduce)
+        read = _reduce(read, signal.reduce)
     stored = np.asarray(read.values, np.float64) * signal.scale + signal.offset
     lengths = np.bincount(read.message, minlength=count)
     return {
@@ -147,7 +147,7 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
     }  # fmt: skip
 
 
-def _measured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
+def _mask_unmeasured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
     """Replace values by NaN that messages mark as not measured."""
     markings = (read_element(columns, path)[read.message] for path in rule.marked_by)
     return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *markings))
@@ -185,7 +185,7 @@ def _texts(values: NDArray[Any]) -> list[str]:
     return [str(value) for value in (values if values.dtype.kind == "O" else values.astype(str))]
 
 
-def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
+def _reduce(read: PathValues, how: Reduce | None) -> PathValues:
     """Reduce the finite elements of each message to one number; without any, it has no value."""
     finite = np.isfinite(read.values)
     values, owner = np.asarray(read.values[finite], np.float64), read.message[finite]
@@ -218,7 +218,7 @@ class Custom:
             ]
             + [
                 f"signals.{name}: {column.unmeasured:,} of {len(column.values):,} messages of"
-                f" {column.signal.topic} say that it was not measured ({_how(column.signal)}): null"
+                f" {column.signal.topic} mark it as not measured ({_marking(column.signal)}): null"
                 for name, column in self.columns.items()
                 if column.unmeasured
             ]
@@ -240,7 +240,7 @@ class Custom:
                 {
                     "name": column.name,
                     "unit": about.get("unit", ""),
-                    "type": _said(column.type == LIST, about.get("length")),
+                    "type": _type_name(column.type == LIST, about.get("length")),
                     "topic": about["topic"],
                     "path": about["path"],
                     "meaning": about.get("meaning", ""),
@@ -257,7 +257,7 @@ class Custom:
         return self.table.take(pa.array(ticks))
 
 
-def _said(is_list: bool, length: str | None) -> str:
+def _type_name(is_list: bool, length: str | None) -> str:
     return (f"list[{length}]" if length else "list") if is_list else "number"
 
 
@@ -295,5 +295,5 @@ def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomCol
     return CustomColumn(signal, values, unread, unmeasured)
 
 
-def _how(signal: CustomSignal) -> str:
+def _marking(signal: CustomSignal) -> str:
     return " or ".join(rule.words for rule in conventions_of(signal.type, signal.path))

@@ -188,7 +188,7 @@ def split(task: Task, steps: Steps) -> Split:
     return _Walk(task, steps, terminated(task, steps.signals), old_route).walk()
 
 
-def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
+def explain_no_transitions(steps: Steps, episodes: Split) -> tuple[str, str | None]:
     """Return why a recording has no transition, and the remedy if one is known."""
     reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     why = [f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons]
@@ -251,13 +251,13 @@ class _Walk:
     def walk(self) -> Split:
         follows = self.steps.follows.tolist()
         for tick in range(len(self.steps)):
-            if self.first is None or not self._goes_on(tick, self.first, follows[tick]):
+            if self.first is None or not self._continues(tick, self.first, follows[tick]):
                 self._begin(tick)
         if self.first is not None:
             self._close(len(self.steps) - 1, "end of the recording")
         return Split(self.episodes, dict(self.dropped))
 
-    def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
+    def _continues(self, tick: int, first: int, follows: bool) -> bool:
         """Return whether the open episode uses this tick; close it if it ends by this tick."""
         if not follows:
             self._close(tick - 1, self.steps.problem[tick] or self.steps.break_reason[tick])

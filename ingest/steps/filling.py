@@ -205,26 +205,26 @@ class Filling:
         On a running robot, `tracker` and `past` hold the state of the ticks before the last one.
         With them, tracks and the task's own entries are computed only for the last tick.
         """
-        self._numbers(
+        self._fill_numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
         )
-        self._pose()
-        lateral_by_poses = self._wheels()
+        self._fill_pose()
+        lateral_by_poses = self._fill_wheels()
         instead = {
             "gyro_yaw_rate_radps": self.signals["wheel_yaw_rate_radps"],
             "accel_x_mps2": np.zeros(len(self.tick_ns)),
         }
         if "imu" in self.inputs.by_name:
-            self._numbers(
+            self._fill_numbers(
                 "imu", instead, yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2"
             )
             if self.inputs.no_estimate("imu", "yaw_rate_radps").all():
                 self.stand_ins["imu"] = NO_ESTIMATE["angular_velocity"].removeprefix(": ")
         else:
             self.signals |= {name: column.copy() for name, column in instead.items()}
-        self._scans()
-        self._bumper()
-        self._nav_command()
+        self._fill_scans()
+        self._fill_bumper()
+        self._fill_nav_command()
         self.notes += [
             f"{name}: {count:,} of {len(self.inputs.topics[source.topic]):,} messages of"
             f" {source.topic} have no estimate of {field} ({how}){NO_ESTIMATE.get(field, '')}"
@@ -232,9 +232,9 @@ class Filling:
             if (source := self.inputs.by_name[name])
         ]
         if self.profile.goal_source == "hindsight":
-            self._hindsight()
+            self._fill_route_in_hindsight()
         elif self.task.goal == "route":
-            self._route()
+            self._fill_route()
         signals, routing = self.signals, self.routing
         signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
         self._find_breaks()
@@ -355,23 +355,23 @@ class Filling:
     def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
         """Mark ticks as invalid by their reasons (T,); "" marks nothing."""
         for reason in sorted(set(reasons) - {""}):
-            said = f"{name}: {reason}" if name else reason
-            self._mark_invalid(reasons == reason, said, route=route)
+            text = f"{name}: {reason}" if name else reason
+            self._mark_invalid(reasons == reason, text, route=route)
 
-    def _required(self, name: str, *, route: bool = False) -> LatestMessages:
+    def _latest_required(self, name: str, *, route: bool = False) -> LatestMessages:
         latest = self.aligned.latest(name)
         self._mark_invalid(~latest.known, f"{name}: not yet received", route=route)
         self._mark_invalid(~latest.fresh, f"{name}: stale", route=route)
         return latest
 
-    def _numbers(
+    def _fill_numbers(
         self, name: str, instead: Mapping[str, F64] | None = None, /, **signal_of: str
     ) -> None:
         """Convert fields of a required input to signals; a tick is 0 if its value is unusable.
 
         A message without an estimate is replaced by `instead`, if given, else it is a problem.
         """
-        latest = self._required(name)
+        latest = self._latest_required(name)
         for key, signal in signal_of.items():
             values = self.inputs.numbers(name, key)
             column = values[latest.row] if len(values) else np.zeros(len(latest.row))
@@ -381,20 +381,20 @@ class Filling:
                     column = np.where(none, instead[signal], column)
                 elif none.any():
                     self._mark_invalid(none, f"{name}: no estimate")
-            self._set(name, signal, column, latest.known)
+            self._fill_signal(name, signal, column, latest.known)
 
-    def _set(self, name: str, signal: str, values: F64, known: Bools) -> None:
+    def _fill_signal(self, name: str, signal: str, values: F64, known: Bools) -> None:
         sane = np.abs(values) <= LARGEST  # False for NaN
         self._mark_invalid(~np.isfinite(values), f"{name}: not finite")
         self._mark_invalid(~sane, f"{name}: {TOO_LARGE if name == 'pose' else 'not finite'}")
         self.signals[signal] = np.where(sane & known, values, 0.0)
 
-    def _wheels(self) -> F64 | None:
+    def _fill_wheels(self) -> F64 | None:
         """Set the wheels' speeds; if they come from poses, return the sideways speed (T,)."""
         motion = self.profile.motion
         if motion is None:
             speeds = {"speed_mps": "wheel_speed_mps", "yaw_rate_radps": "wheel_yaw_rate_radps"}
-            self._numbers("wheels", **speeds)
+            self._fill_numbers("wheels", **speeds)
             return None
         jump_m = self.profile.episodes.max_pose_jump_m
         fastest_mps = self.task.condition_limits["fastest_mps"]
@@ -404,11 +404,11 @@ class Filling:
         ]
         for signal, name in (("speed_mps", "forward_mps"), ("yaw_rate_radps", "yaw_rate_radps")):
             column = np.concatenate([getattr(part, name) for part in parts])
-            self._set("wheels", f"wheel_{signal}", column, np.ones(len(column), np.bool_))
+            self._fill_signal("wheels", f"wheel_{signal}", column, np.ones(len(column), np.bool_))
         self._mark_reasons("wheels", np.concatenate([part.problem for part in parts]))
         return np.concatenate([part.lateral_mps for part in parts])
 
-    def _pose(self) -> None:
+    def _fill_pose(self) -> None:
         if "pose" in self.inputs.by_name:
             latest = self.aligned.latest("pose")
             usable = latest.known & latest.fresh
@@ -416,7 +416,7 @@ class Filling:
                 problem = np.where(usable, self.inputs.fixed.problem[latest.row], "")
                 self._mark_reasons("pose", problem)
                 usable &= problem == ""
-            self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
+            self._fill_numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
             self.signals["pose_stamp_ns"] = self.tick_ns - latest.age_ns
             self.located = usable
             return
@@ -426,11 +426,11 @@ class Filling:
         self._mark_reasons("pose", at.problem)
         x, y = (at.translation_m[:, :2] - self.inputs.origin_m).T
         for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
-            self._set("pose", f"pose_{signal}", values, at.problem == "")
+            self._fill_signal("pose", f"pose_{signal}", values, at.problem == "")
         self.located = np.asarray(at.problem == "", np.bool_)
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
-    def _scans(self) -> None:
+    def _fill_scans(self) -> None:
         """Set the clearance; with several lidars, the smallest of all.
 
         Clearance is NaN for a task without a lidar. If the task has a lidar but the recording lacks
@@ -444,14 +444,14 @@ class Filling:
             self._mark_invalid(np.ones(count, np.bool_), "scan: not yet received")
         for name, source in self.profile.inputs.scans.items():
             if name in self.inputs.by_name:
-                self._scan(name, source, sectors)
+                self._fill_scan(name, source, sectors)
         sectors = with_unseen(sectors, float(self.task.range_max_m))
         nearest = sectors.min(axis=1) if self.task.sectors else np.full(count, np.nan)
         self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
 
-    def _scan(self, name: str, source: Input, sectors: F64) -> None:
+    def _fill_scan(self, name: str, source: Input, sectors: F64) -> None:
         """Lower `sectors` (T, K) to the clearance of one lidar; NaN there means not yet known."""
-        latest, count = self._required(name), len(self.tick_ns)
+        latest, count = self._latest_required(name), len(self.tick_ns)
         fields: Fields = self.inputs.topics[source.topic].fields
         if SECTORS not in fields:  # whole scans, which the readers of recordings reduce
             fields = scan_reduction(self.task, source).apply(fields)
@@ -478,12 +478,12 @@ class Filling:
             stamp_ns = self.tick_ns - latest.age_ns
             self.scan_stamp_ns[fresh] = np.maximum(self.scan_stamp_ns, stamp_ns)[fresh]
 
-    def _bumper(self) -> None:
+    def _fill_bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
         source = self.inputs.by_name.get("bumper")
         if source is not None:
             if source.max_age_s is not None:  # otherwise it publishes only changes
-                self._required("bumper")
+                self._latest_required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
             bumped = [
                 pressed_since(segment.topics[source.topic], pressed, ticks)
@@ -491,7 +491,7 @@ class Filling:
             ]
         self.signals["bumped"] = np.concatenate(bumped)
 
-    def _nav_command(self) -> None:
+    def _fill_nav_command(self) -> None:
         """Set the command that navigation proposes; a tick without one stays usable."""
         count, name = len(self.tick_ns), "nav_command"
         unknown = np.full(count, np.nan)
@@ -516,8 +516,8 @@ class Filling:
             unknown_at = f"{int((~known).sum()):,} of {count:,} ticks"
             self.notes.append(f"{name}: unknown at {unknown_at} ({', '.join(counted)})")
 
-    def _route(self) -> None:
-        latest = {name: self._required(name, route=True) for name in ("goal", "plan")}
+    def _fill_route(self) -> None:
+        latest = {name: self._latest_required(name, route=True) for name in ("goal", "plan")}
         goals, plans = self.inputs.goals, self.inputs.plans
         for name, one in latest.items():
             if name in self.inputs.placed:
@@ -541,7 +541,7 @@ class Filling:
         goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
 
-    def _hindsight(self) -> None:
+    def _fill_route_in_hindsight(self) -> None:
         """Set goals and routes in hindsight; only their signals depend on later messages."""
         xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
         at = np.flatnonzero(self.located)

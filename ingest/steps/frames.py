@@ -122,20 +122,20 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
 def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
     """Return the plain names of frames (N,), sorted, and each frame's index among them, (N,)."""
     place: dict[str, int] = {}  # name as written -> its index, in order of appearance
-    observed = [place.setdefault(name, len(place)) for name in frames.tolist()]
+    place_of = [place.setdefault(name, len(place)) for name in frames.tolist()]
     each = [plain(name) for name in place]
     names = sorted(set(each))
     number = {name: code for code, name in enumerate(names)}
-    return np.array([number[name] for name in each], np.int64)[np.array(observed, np.int64)], names
+    return np.array([number[name] for name in each], np.int64)[np.array(place_of, np.int64)], names
 
 
 def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
     """Return a frame and all frames that are ever its ancestors."""
     reached, open_ = set[str](), {frame}
     while open_:
-        here = open_.pop()
-        reached.add(here)
-        open_ |= set(parents.get(here, ())) - reached
+        ancestor = open_.pop()
+        reached.add(ancestor)
+        open_ |= set(parents.get(ancestor, ())) - reached
     return reached
 
 
@@ -201,14 +201,14 @@ class Tree:
         out.stamp_ns[:] = np.concatenate([*times, np.zeros(0, np.int64)])
         transforms = self._hold_above(frame, times)
         if not transforms:
-            out.problem[:] = self._apart([source], [fixed])
+            out.problem[:] = self._describe_gap([source], [fixed])
             return out
         ups = np.stack([one.parent for one in transforms.values()], axis=1)  # (T, C)
         trees, which = np.unique(ups, axis=0, return_inverse=True)
         for index, tree in enumerate(trees):
             rows = np.flatnonzero(which.reshape(-1) == index)
             parent = {child: int(up) for child, up in zip(transforms, tree, strict=True) if up >= 0}
-            self._fill(out, rows, transforms, _way(source, parent), _way(fixed, parent))
+            self._fill(out, rows, transforms, _path_up(source, parent), _path_up(fixed, parent))
         return out
 
     def times(self, frame: str) -> list[Ints]:
@@ -232,7 +232,7 @@ class Tree:
             child: int(one.parent[0]) for child, one in transforms.items() if one.parent[0] >= 0
         }
         up, other = (
-            _way(number, parent) for number in map(self._number, (frame, self.frames.fixed))
+            _path_up(number, parent) for number in map(self._number, (frame, self.frames.fixed))
         )
         top = next(number for number in up if number in other)
         return [
@@ -261,7 +261,7 @@ class Tree:
         """Set the poses at the times `rows`, when the paths to the root are `up` and `other`."""
         meet = next((frame for frame in up if frame in other), None)
         if meet is None:
-            out.problem[rows] = self._apart(up, other)
+            out.problem[rows] = self._describe_gap(up, other)
             return
         outward = self._compose(out, rows, transforms, up[: up.index(meet)])
         homeward = self._compose(out, rows, transforms, other[: other.index(meet)])
@@ -294,13 +294,13 @@ class Tree:
                 out.problem[first] = f"transform {names}: {reason}"
         return rotation, translation
 
-    def _apart(self, up: list[int], other: list[int]) -> str:
+    def _describe_gap(self, up: list[int], other: list[int]) -> str:
         return f"no transform from {self._name(other[-1])} to {self._name(up[-1])} yet"
 
     def _hold(self, child: str, times: Sequence[Ints]) -> _Transform:
         """Return a frame's transform at these times: from `/tf` if there is one, else static."""
-        moving = self._of(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
-        still = self._of(f"{self.frames.static_topic} {child}", times, None)
+        moving = self._hold_in(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
+        still = self._hold_in(f"{self.frames.static_topic} {child}", times, None)
         if moving is None or still is None:
             only = moving if moving is not None else still
             assert only is not None
@@ -313,7 +313,9 @@ class Tree:
             both[name] = np.where(use.reshape(-1, *[1] * (a.ndim - 1)), a, b)
         return _Transform(moving=use, **both)
 
-    def _of(self, name: str, times: Sequence[Ints], max_age_s: float | None) -> _Transform | None:
+    def _hold_in(
+        self, name: str, times: Sequence[Ints], max_age_s: float | None
+    ) -> _Transform | None:
         columns = self.edges.topics.get(name)
         if columns is None:
             return None
@@ -356,7 +358,7 @@ def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _way(frame: int, parent: Mapping[int, int]) -> list[int]:
+def _path_up(frame: int, parent: Mapping[int, int]) -> list[int]:
     """Return the frames from this one up to the root; a loop ends before it repeats a frame."""
     way = [frame]
     while way[-1] in parent and parent[way[-1]] not in way:

@@ -299,7 +299,7 @@ class InputColumns:
         source = self.by_name[name]
         columns = self.topics[source.topic]
         none = np.zeros(len(columns), np.bool_)
-        for rule in _said_of(source, source.fields.get(key, "")):
+        for rule in _marks(source, source.fields.get(key, "")):
             none |= _flags(columns, rule)
         return none
 
@@ -307,7 +307,7 @@ class InputColumns:
         """Yield inputs with messages without an estimate: name, field, count, and their marking."""
         for name, source in self.by_name.items():
             columns = self.topics[source.topic]
-            rules = (rule for path in source.fields.values() for rule in _said_of(source, path))
+            rules = (rule for path in source.fields.values() for rule in _marks(source, path))
             for rule in dict.fromkeys(rules):
                 if count := int(_flags(columns, rule).sum()):
                     yield name, rule.values[0], count, rule.words
@@ -342,13 +342,13 @@ class InputColumns:
     def _heading_at(self, time_ns: Ints) -> F64:
         """Return the latest heading received at these log times, (N,); NaN if unknown or stale."""
         source = self.by_name["heading"]
-        said_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
-        order = np.argsort(said_ns, kind="stable")
-        said_ns, yaw = said_ns[order], yaw[order]
-        last = np.searchsorted(said_ns, time_ns, "right") - 1
+        heading_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
+        order = np.argsort(heading_ns, kind="stable")
+        heading_ns, yaw = heading_ns[order], yaw[order]
+        last = np.searchsorted(heading_ns, time_ns, "right") - 1
         known = last >= 0
-        if source.max_age_s is not None and len(said_ns):
-            known &= time_ns - said_ns[last] <= source.max_age_s * NS
+        if source.max_age_s is not None and len(heading_ns):
+            known &= time_ns - heading_ns[last] <= source.max_age_s * NS
         return np.where(known, yaw[last], np.nan) if len(yaw) else np.full(len(time_ns), np.nan)
 
     @cached_property
@@ -408,7 +408,7 @@ def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Red
             rule
             for source in sources
             for path in source.fields.values()
-            for rule in _said_of(source, path)
+            for rule in _marks(source, path)
             if set(rule.fields) <= set(fields)
         )
     )
@@ -421,7 +421,7 @@ def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Red
     return Reduction(tuple(dict.fromkeys(path for rule in rules for path in rule.fields)), apply)
 
 
-def _said_of(source: Input, path: str) -> list[Convention]:
+def _marks(source: Input, path: str) -> list[Convention]:
     return [rule for rule in conventions_of(source.type, path) if rule.of_messages]
 
 

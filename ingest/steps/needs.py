@@ -34,7 +34,7 @@ from restock.ingest.profile.signal_paths import (
 from restock.ingest.profile.tables import CLOUD, SCANS, CustomSignal, Input
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
-from restock.ingest.steps.cameras import TYPES, frame_reduction, other_field
+from restock.ingest.steps.cameras import TYPES, frame_reduction, wrong_field
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.clouds import CLOUD_PATHS, cloud_reduction
 from restock.ingest.steps.custom_columns import custom_reduction
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
 
 NEARLY = 0.8  # similarity from which a topic may be a misspelling: /plan is not /scan
-MAX_TOLD = 20  # topics listed in an error, as a fleet's nightly ingest prints one per recording
+MAX_LISTED = 20  # topics listed in an error, as a fleet's nightly ingest prints one per recording
 OTHER_FIELDS = (
     "correct the profile; if the messages changed with an update of the robot, ingest the "
     "recordings from before and after it with a profile each: a copy with the other field and "
@@ -99,11 +99,11 @@ def read_topics(
     return columns
 
 
-def _told(profile: Profile, available: Mapping[str, Any]) -> str:
+def _list(profile: Profile, available: Mapping[str, Any]) -> str:
     """List a recording's topics; if there are many, only those of types that the profile uses."""
     types = {source.type for source in profile.sources.values()}
     usable = [topic for topic in sorted(available) if available[topic].type in types]
-    topics = sorted(available) if len(available) <= MAX_TOLD else usable[:MAX_TOLD]
+    topics = sorted(available) if len(available) <= MAX_LISTED else usable[:MAX_LISTED]
     others = len(available) - len(topics)
     more = [f"{others:,} others, which `restock info` lists"] if others else []
     return ", ".join([*topics, *more]) or "none"
@@ -144,7 +144,7 @@ def wanted_fields(
     if problems := input_problems(profile, available, leaves):
         raise RecordingError(
             f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
-            remedy=f"its topics are {_told(profile, available)}; choose another --profile, or let"
+            remedy=f"its topics are {_list(profile, available)}; choose another --profile, or let"
             " `restock profile new RECORDING` propose one (`restock start RECORDING` does so and "
             "continues)"
             if input_problems(profile, available)
@@ -192,8 +192,8 @@ def reductions(
     for source in profile.sources.values():
         inputs.setdefault(source.topic, []).append(source)
     for topic, sources in inputs.items():
-        if said := estimate_reduction(sources, has.get(topic, ())):
-            parts.setdefault(topic, []).append(said)
+        if estimates := estimate_reduction(sources, has.get(topic, ())):
+            parts.setdefault(topic, []).append(estimates)
     for scan in profile.inputs.scans.values():
         if scan.topic in available:
             parts.setdefault(scan.topic, []).append(scan_reduction(profile.task, scan))
@@ -206,10 +206,10 @@ def reductions(
     for topic in dict.fromkeys(camera.topic for camera in profile.cameras.values()):
         if topic in available:
             parts.setdefault(topic, []).append(frame_reduction(available[topic].type))
-    return {topic: _both(some) for topic, some in parts.items()}
+    return {topic: _combine(some) for topic, some in parts.items()}
 
 
-def _both(parts: Sequence[Reduction]) -> Reduction:
+def _combine(parts: Sequence[Reduction]) -> Reduction:
     """Combine several reductions of one topic."""
     if len(parts) == 1:
         return parts[0]
@@ -267,7 +267,7 @@ def input_problems(
         if topic.type not in TYPES:
             what = f"{camera.topic} holds {topic.type}, which is not an image"
             wrong.setdefault(what, []).append(f"cameras.{name}")
-        elif leaves is not None and (field := other_field(topic.type, leaves[camera.topic])):
+        elif leaves is not None and (field := wrong_field(topic.type, leaves[camera.topic])):
             has = f"its {topic.type} has no {field!r} as ROS defines it"
             fields.append(f"`cameras.{name}`: {camera.topic}: {has}")
     hints = {what: near(what.split()[-1], available, types[what]) for what in needed}
@@ -424,7 +424,7 @@ FINE = "nearest return of each fine sector"  # (N, FINE_SECTORS) float64, m; if 
 BEAMS = "number of beams"  # (N,) int64
 CLOSE = "whether a beam is too close to be measured"  # (N,) bool: -inf (REP 117)
 BLIND = "whether no beam has a valid range"  # (N,) bool; inf is valid: nothing was hit
-UNAIMED = "whether its angles say where no beam points"  # (N,) bool: its angles are unusable
+UNAIMED = "whether its angles are unusable"  # (N,) bool
 
 _VALUES = 1 << 18  # ranges reduced at a time, so that intermediate arrays stay in the CPU's cache
 _MAPS = 64  # scan geometries that are cached; a lidar usually has one

@@ -331,7 +331,7 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
     """Return how far (N,) the outline's fastest point can go until the outline meets a return, m.
 
     At most `limits.way_m`, in steps of 2.5 cm. The outline meets a return if, anywhere on the way,
-    it reaches farther along the return's bearing: space behind a return counts as occupied.
+    it reaches beyond the return on the same bearing: space behind a return counts as occupied.
 
     Args:
         direction: (N, 2) m ahead and rad of turn per metre of that point.

@@ -105,7 +105,8 @@ OWN_LIMIT = 20.0  # own entries are clipped to +- this
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
-OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # depend on it
+# Signals that depend on the outline of the robot.
+OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})
 PLAN_SIGNALS = frozenset({"plan_return_m", "plan_gap_m"})  # show obstacles on the plan
 LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 
@@ -289,7 +290,7 @@ class Task(Checked, frozen=True):
 
     @property
     def action_names(self) -> list[str]:
-        """Return the actions' names for people, e.g. `0.8 m/s left 0.7`."""
+        """Return the actions' names for people, such as `drive 0.8 left 0.7`."""
         return [_action_name(*action) for action in self.actions]
 
     @property

@@ -137,8 +137,8 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     assert found["sonar"][-1] is None
     assert {round(beam, 3) for beam in found["beam"]} <= {0.1, 2.0}
     notes = "\n".join(steps.notes)
-    assert "signals.share: 30 of 60 messages of /battery say that it was not measured" in notes
-    assert "signals.sonar: 20 of 60 messages of /sonar say" in notes
+    assert "signals.share: 30 of 60 messages of /battery mark it as not measured" in notes
+    assert "signals.sonar: 20 of 60 messages of /sonar mark" in notes
     assert "signals.voltage" not in notes
 
 

@@ -18,7 +18,7 @@ from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.aligned_inputs import fallbacks_used
-from restock.ingest.steps.episodes import split, steps_of, why_none
+from restock.ingest.steps.episodes import explain_no_transitions, split, steps_of
 from restock.ingest.steps.filling import parse_policy
 
 PROFILE = load_profile("warehouse_amr")
@@ -104,7 +104,7 @@ def test_positions_far_from_their_origin_are_refused():
     topics["/amcl_pose"].fields["pose.pose.position.y"][:] += 5.2e6
     steps = steps_of(PROFILE, topics)
     assert set(steps.problem) == {"pose: beyond a million"}
-    why, remedy = why_none(steps, split(PROFILE.task, steps))
+    why, remedy = explain_no_transitions(steps, split(PROFILE.task, steps))
     assert f"pose: beyond a million: {len(steps)} of {len(steps)} ticks" in why
     assert remedy is not None
     assert "set `origin_m = [X, Y]`" in remedy
