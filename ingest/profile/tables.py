@@ -524,8 +524,8 @@ def _check_cloud(key: str, source: Input, where: str) -> None:
         raise ConfigError(
             f"`{key}`: a point cloud is read as the scan of a slice of it",
             where=where,
-            remedy="say which: height_m = [LOW, HIGH] above the lidar, of what the robot can run"
-            f" into, and the fields of that scan: fields = {{ {fields} }}",
+            remedy="give the slice, height_m = [LOW, HIGH] above the lidar, at which the robot can"
+            f" hit something, and the fields of that scan: fields = {{ {fields} }}",
         )
     for setting in ("height_m", "angle_rad"):
         low, high = getattr(source, setting) or (0, 1)
@@ -550,7 +550,7 @@ def _check_units(key: str, source: Input, where: str) -> None:
     for field, path in source.fields.items():
         if factor_of(field, path) is None:
             raise ConfigError(
-                f"`{key}.fields.{field}`: {path!r} is not in a unit that is converted",
+                f"`{key}.fields.{field}`: {path!r} has an unknown unit",
                 where=where,
                 remedy=f"after a speed or a yaw rate:{IN}"
                 + ", ".join(unit for units in UNITS.values() for unit in units),

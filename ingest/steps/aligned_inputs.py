@@ -332,7 +332,7 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
         ]
         if ("goal" in inputs.by_name) and len(set().union(*found.values())) > 1:
             notes.append(
-                f"frames: {'; '.join(reported)}: they are treated as if they were one: the profile "
+                f"frames: {'; '.join(reported)}: they are treated as one frame, as the profile "
                 "has no [frames]"
             )
     return notes

@@ -83,7 +83,7 @@ def compressed_layout(data: bytes, message_format: str) -> ImageLayout:
     elif not data:
         raise ImageProblem("no bytes")
     else:
-        raise ImageProblem(f"neither JPEG nor PNG (its format says {message_format[:60]!r})")
+        raise ImageProblem(f"neither JPEG nor PNG (its format is {message_format[:60]!r})")
     _check_size(layout)
     return layout
 

@@ -141,8 +141,8 @@ def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
     found = []
     if clock.set_back:
         what = (
-            f"log time goes back {counted(clock.set_back, 'time')} on every topic; an episode ends,"
-            " and a new one begins, there"
+            f"log time goes back {counted(clock.set_back, 'time')} on every topic, which starts a"
+            " new episode"
         )
         cause, remedy = "the recorder's clock was set back", "set its clock before a drive"
         found.append(Finding("clock", "all topics", what, steps, cause, remedy, repaired=True))
@@ -150,9 +150,9 @@ def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
         where = "ahead of" if ahead_ns > 0 else "behind"
         what = (
             f"its stamps are {abs(ahead_ns) / NS:.2f} s {where} the clock of the other topics; its"
-            " messages count from their reception"
+            " messages are timed by their reception"
         )
-        cause = "the clock of the computer that stamps them is another one"
+        cause = "the computer that stamps them has another clock"
         remedy = "synchronise the clocks (chrony, PTP)"
         found.append(Finding("clock", topic, what, steps, cause, remedy, repaired=True))
     return found
@@ -195,7 +195,7 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
         Finding(
             "sources",
             topic,
-            f"its poses step at {np.median(speed[beyond]):.2g} m/s (median) where neither commands"
+            f"its poses step at {np.median(speed[beyond]):.2g} m/s (median), but neither commands"
             f" nor wheels exceed {most:.2g} m/s",
             count,
             "two publishers on one topic, or a localiser that jumps",
@@ -251,8 +251,8 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
     text += f", in {len(ratio)} stretches of {WINDOW_S:g} s"
     remedy = {
         "wheels": "take the speeds from the poses ([motion] instead of [inputs.wheels]), or"
-        " correct what publishes it",
-        "gyro": "leave out [inputs.imu], or correct what publishes it",
+        " correct their publisher",
+        "gyro": "leave out [inputs.imu], or correct its publisher",
     }[kind]
     return [Finding(kind, topic, text, steps, cause, remedy)]
 
@@ -286,13 +286,13 @@ def _spikes(inputs: InputColumns, drive: Drive) -> list[Finding]:
                 "rates",
                 source.topic,
                 f"{int(beyond.sum()):,} of {counted(len(reported), 'message')} report"
-                f" {size:.3g} {unit[:-2]}/s (median), where commands and poses stay below"
+                f" {size:.3g} {unit[:-2]}/s (median), but commands and poses stay below"
                 f" {most:.2g} {unit[:-2]}/s",
                 int((np.abs(drive.signals[signal]) > limit).sum()),
                 "the driver differentiates a heading across its wrap at pi"
                 if wraps
-                else "single values that nothing else shows",
-                "correct what publishes it, or take the speeds from the poses ([motion])",
+                else "single values that no other source confirms",
+                "correct its publisher, or take the speeds from the poses ([motion])",
             )
         )
     return found
@@ -317,7 +317,7 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
                     f" that it follows (correlation {by_lag[best]:.2f}, {by_lag[most]:.2f} as"
                     " stamped)",
                     len(requested),
-                    "one of the two has the times of another clock",
+                    "one of the two is stamped by another clock",
                     'set [clock] alignment = "log_time" in the profile, and synchronise the clocks',
                 )
             ]

@@ -304,7 +304,7 @@ def repeatability_problem(sql: str) -> str | None:
             if not name.startswith("current_"):
                 continue
         if name in _volatile() - _ZONES or (name == "age" and len(part["arguments"]) == 1):
-            return f"{name}() may differ from one time to the next"
+            return f"{name}() may differ from one call to the next"
         if kind == "WINDOW" and not part["orders"] and _depends_on_order(part):
             return f"{name}() OVER (…) without ORDER BY depends on the order in which rows are read"
     return None

@@ -130,7 +130,7 @@ def test_a_frame_that_is_too_old_is_in_force_no_more(tmp_path):
     ("make", "said"),
     [
         (lambda data: data[: len(data) // 2], "truncated JPEG"),
-        (lambda data: b"\x00\x00\x00\x01\x67" + data, "neither JPEG nor PNG (its format says"),
+        (lambda data: b"\x00\x00\x00\x01\x67" + data, "neither JPEG nor PNG (its format is"),
     ],
 )
 def test_what_is_no_image_is_counted_and_named(tmp_path, make, said):

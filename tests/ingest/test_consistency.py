@@ -238,7 +238,7 @@ WRONG = {
     "rate": (lambda t: scaled(t, "/odom", -1, RATE), "wheels", "/odom", "its yaw rate is -1"),
     "degrees": (lambda t: scaled(t, "/imu", 57.3, GYRO), "gyro", "/imu", "57 times"),
     "no gyro": (lambda t: scaled(t, "/imu", 0, GYRO), "gyro", "/imu", "stays at 0"),
-    "wrapped": (wrapped, "rates", "/odom", "3 of 900 messages report 125 rad/s (median), where"),
+    "wrapped": (wrapped, "rates", "/odom", "3 of 900 messages report 125 rad/s (median), but"),
     "late odometry": (lambda t: shifted(t, "/odom", -0.6), "order", "/odom", "before the commands"),
 }
 

@@ -267,7 +267,7 @@ def test_frames_that_differ_without_transforms_are_said():
     for topic, frame in (("/goal_pose", "map"), ("/plan", "odom")):
         topics[topic].fields["header.frame_id"] = np.array([frame, None], object)[:-1]
     steps = steps_of(load_profile("warehouse_amr"), topics)
-    assert "goal map; plan odom: they are treated as if they were one" in steps.notes[0]
+    assert "goal map; plan odom: they are treated as one frame" in steps.notes[0]
 
 
 @pytest.mark.parametrize(

@@ -314,7 +314,7 @@ def test_dead_reckoning_follows_the_arc():
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("theta_vel in deg/s", "theta_vel in furlongs", "is not in a unit that is converted"),
+        ("theta_vel in deg/s", "theta_vel in furlongs", "has an unknown unit"),
         ('speed_mps = "x_vel", yaw', 'x_m = "x_vel", speed_mps = "x_vel", yaw', "unknown 'x_m'"),
         ('speed_mps = "x_vel", yaw', 'sideways_mps = "x_vel", yaw', "missing 'speed_mps'"),
     ],
