@@ -282,7 +282,7 @@ class EpisodeQueue(Stateful):
     """A queue of episodes. An environment's n-th drawn episode does not depend on the others.
 
     `conditions` are shares per kind of episode; a schedule draws a perturbation for each drawn
-    episode. If missions are ordered (`follow`), a share of the drawn episodes is of those.
+    episode. If missions are ordered (`follow`), a share of the drawn episodes comes from them.
 
     Raises:
         ConfigError: an unknown condition, or shares that are not numbers of at least 0.

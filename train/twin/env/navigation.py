@@ -387,7 +387,7 @@ _TEXTS, _EXPOSED = _texts(NAMES), _texts(EXPOSURES)
 AFTERMATH_S = 2.0
 CLOSING_WITHIN_M, CLOSING_MPS = 2.0, 0.1
 VIEW_M = tuple(0.2 * step for step in range(1, 12))  # distances ahead at which pallets are sought
-BLOCK_AHEAD = 6  # the first so many, to 1.2 m, decide blocked_aisle
+BLOCK_AHEAD = 6  # the first six, to 1.2 m, decide blocked_aisle
 REACH_M = VIEW_M[-1] + 1.5  # a pallet farther away than this is not in view
 MARGIN = 0.4  # how far beside the plan a pallet is in the way, as a share of the body's width
 

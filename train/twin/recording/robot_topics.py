@@ -499,7 +499,7 @@ def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
 
 
 def on_floor(places: F64) -> Bools:
-    """Return which places (…, 2 or more) are on the floor, not where unused bodies are parked."""
+    """Return which places (…, 2 or more) are on the floor, not among parked bodies."""
     return np.asarray(places[..., 0] > PARKED_M[0] / 2, np.bool_)
 
 
