@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.conditions import unseen
+from restock.ingest.task.conditions import signals_named
 from restock.ingest.task.task import LIDAR_SIGNALS
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.twin.env.drivers import PlannerFollower
@@ -63,6 +63,6 @@ def test_the_planner_follows_its_plan_and_stops_for_nothing():
 
 def test_the_twin_labels_what_logs_can_be_labelled_by():
     evaluated, lost = conditions_in_twin(PROFILE.conditions, PROFILE.signals, lidar=False)
-    assert lost == unseen(PROFILE.conditions) != {}
+    assert lost == signals_named(PROFILE.conditions) != {}
     assert [one.name for one in evaluated] == ["wheel_slip"]
     assert conditions_in_twin(PROFILE.conditions, PROFILE.signals) == (PROFILE.conditions, {})

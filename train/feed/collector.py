@@ -24,7 +24,7 @@ from restock.ingest.task.conditions import (
     of_kind,
     primary,
     runnable,
-    unseen,
+    signals_named,
 )
 from restock.ingest.task.schema import signal_arrays, steps_schema
 from restock.ingest.task.task import STORED_SIGNALS, Signals, Task
@@ -336,7 +336,7 @@ def conditions_in_twin(
         ConfigError: a condition does not run for another reason.
     """
     steps = steps_schema().empty_table()
-    needed: dict[str, list[str]] = {} if lidar else unseen(conditions)
+    needed: dict[str, list[str]] = {} if lidar else signals_named(conditions)
     conditions = [condition for condition in conditions if condition.name not in needed]
     evaluated = runnable(steps, conditions)
     for condition in conditions:
