@@ -82,24 +82,24 @@ def run_part(
 
 @pytest.mark.docs
 @pytest.mark.parametrize("part", PARTS_RUN, ids=part_name)
-def test_a_page_runs_as_printed(part, server, prepared, tmp_path):
+def test_page_runs_as_printed(part, server, prepared, tmp_path):
     run_part(part, server, prepared, tmp_path / "reader", slow=False)
 
 
 @pytest.mark.docs
 @pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS_SLOW, ids=part_name)
-def test_a_page_runs_with_its_slow_blocks(part, server, prepared, tmp_path):
+def test_page_runs_with_slow_blocks(part, server, prepared, tmp_path):
     run_part(part, server, prepared, tmp_path / "reader", slow=True)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
-def test_blocks_are_fenced_and_name_their_language(page: Path) -> None:
+def test_blocks_are_fenced_and_name_a_language(page: Path) -> None:
     assert indented(page) == []
     assert [b.place for b in ALL[page] if b.language not in LANGUAGES] == []
 
 
-def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
+def test_unrun_blocks_are_few_and_give_reasons() -> None:
     """Each needs what no test has. A new one is counted here, so that it is seen in review."""
     reported = [block for block in chain(*ALL.values()) if block.language in RUN]
     left_out = {b.place: b.marks["not run"] for b in reported if "not run" in b.marks}
@@ -169,5 +169,5 @@ CHECKS: dict[str, Callable[[Block, Path], None]] = {
 
 
 @pytest.mark.parametrize("block", TOML, ids=lambda block: block.place)
-def test_a_block_of_toml_is_accepted(block: Block, tmp_path: Path) -> None:
+def test_toml_block_is_accepted(block: Block, tmp_path: Path) -> None:
     CHECKS[block.page](block, tmp_path)

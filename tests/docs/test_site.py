@@ -10,7 +10,7 @@ from support.paths import ROOT
 
 
 @pytest.mark.long
-def test_the_site_is_whole_and_loads_nothing(tmp_path: Path) -> None:
+def test_site_builds_and_loads_nothing_external(tmp_path: Path) -> None:
     config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     config = config.replace("build/pages", "pages").replace("build/site", "site")
     (tmp_path / "mkdocs.yml").write_text(config.replace("[src]", f"[{ROOT / 'src'}]"))

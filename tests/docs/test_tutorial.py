@@ -30,7 +30,7 @@ def check_verdicts(notebook: nbformat.NotebookNode) -> None:
     assert supply["dry"] < 0.1 < min(supply["sound"], supply["frozen"])
 
 
-def test_a_page_becomes_cells_and_takes_their_outputs() -> None:
+def test_page_and_notebook_convert_both_ways() -> None:
     page = """# A page
 
 ```python
@@ -66,7 +66,7 @@ The end.
 
 @pytest.mark.docs
 @pytest.mark.timeout(900)
-def test_the_tutorial_runs_and_its_verdicts_stand(tmp_path: Path) -> None:
+def test_tutorial_runs_with_stated_verdicts(tmp_path: Path) -> None:
     docs = tmp_path / "docs"
     docs.mkdir()
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")

@@ -55,7 +55,7 @@ def test_values_agree_with_value_iteration(settings: dict[str, object]) -> None:
     np.testing.assert_allclose(learnt(config(**settings)), corridor()[1], atol=0.06)
 
 
-def test_margin_makes_the_experts_action_the_best() -> None:
+def test_margin_makes_expert_action_greedy() -> None:
     rows, _ = corridor()
     backs = rows[:, 2 * STATES] == 0  # an expert who goes back
     values = learnt(config(loss__margin=5.0), logged=len(rows), expert=backs)

@@ -66,7 +66,7 @@ def learnt(panel: Panel, run: Path, *, seed: int = 0, **options: Any) -> list[np
     return batches
 
 
-def test_the_record_is_what_the_loop_was_given(panels: dict[str, Panel], tmp_path: Path) -> None:
+def test_record_matches_sampled_batches(panels: dict[str, Panel], tmp_path: Path) -> None:
     panel = panels["quotas"]
     batches = learnt(panel, tmp_path / "run")
     row_of = {row.tobytes(): at for at, row in enumerate(panel.rows[:, :3])}
@@ -87,9 +87,7 @@ def test_the_record_is_what_the_loop_was_given(panels: dict[str, Panel], tmp_pat
     assert [row["panel_row"] for row in tables["audit"]] == drawn.tolist()
 
 
-def test_runs_that_were_fed_differently_are_refused(
-    panels: dict[str, Panel], tmp_path: Path
-) -> None:
+def test_runs_fed_differently_are_incomparable(panels: dict[str, Panel], tmp_path: Path) -> None:
     runs = {
         name: [tmp_path / f"{name}{seed}" for seed in range(3)] for name in ("quotas", "uniform")
     }
@@ -111,9 +109,7 @@ def test_runs_that_were_fed_differently_are_refused(
     assert {symptom.condition for symptom in found.figures[0].symptoms} == {"nominal", "rare"}
 
 
-def test_fresh_steps_have_the_condition_that_the_task_names(
-    panels: dict[str, Panel], tmp_path: Path
-) -> None:
+def test_fresh_steps_take_condition_from_info(panels: dict[str, Panel], tmp_path: Path) -> None:
     options = {"run": tmp_path / "run", "logs_share": 0.5, "log_every": 5}
     buffer = MixtureReplayBuffer(60, *SPACES, "cpu", panel=panels["quotas"], **options)
     names = ["nominal", "rare", "rare", "wet", None, "nominal"]  # a condition an episode
@@ -136,7 +132,7 @@ def test_fresh_steps_have_the_condition_that_the_task_names(
 
 
 @pytest.mark.parametrize("lacking", ["target", "evaluation"])
-def test_a_diagnosis_says_what_the_loop_did_not(
+def test_diagnosis_names_missing_record(
     panels: dict[str, Panel], tmp_path: Path, lacking: str
 ) -> None:
     if lacking == "target":
@@ -149,16 +145,14 @@ def test_a_diagnosis_says_what_the_loop_did_not(
         diagnose([Run.open(tmp_path / "run")])
 
 
-def test_other_observations_than_the_tables_are_refused(panels: dict[str, Panel]) -> None:
+def test_wrong_observation_size_is_rejected(panels: dict[str, Panel]) -> None:
     space = gym.spaces.Box(-9, 9, (2,), np.float32)
     buffer = MixtureReplayBuffer(9, space, SPACES[1], panel=panels["quotas"])
     with pytest.raises(PanelError, match="have 3 entries, the environment's have 2"):
         buffer.sample(1)
 
 
-def test_the_twins_verbs_say_that_it_has_no_profile(
-    panels: dict[str, Panel], tmp_path: Path
-) -> None:
+def test_profile_of_generic_task_run_is_rejected(panels: dict[str, Panel], tmp_path: Path) -> None:
     from restock.train.run.run_profile import profile_of_run
 
     learnt(panels["quotas"], tmp_path / "run")

@@ -191,7 +191,7 @@ def test_sound_rows_are_healthy(logs: FedRows, twin: FedRows, with_twin: bool) -
 
 
 @pytest.mark.parametrize("fault", PLANTED)
-def test_what_is_wrong_is_named(logs: FedRows, twin: FedRows, fault: str) -> None:
+def test_planted_fault_is_named(logs: FedRows, twin: FedRows, fault: str) -> None:
     plant, cause = PLANTED[fault]
     for against in (twin, None):
         if against is None and cause in ("LIDAR_SCALED", "SENSOR_BIASED"):
@@ -208,7 +208,7 @@ def _named(found: RowDiagnosis) -> list[str]:
 
 
 @pytest.mark.parametrize(("high", "named"), [(-0.9, "MIRRORED"), (0.5, "MIXED")])
-def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -> None:
+def test_mirrored_needs_interval_below_zero(high: float, named: str) -> None:
     answers = []
     for relation in RELATIONS:
         off = relation.x == ACTION_TURN
@@ -232,7 +232,7 @@ def test_only_a_sure_opposite_sign_is_called_mirrored(high: float, named: str) -
         ("groups of recordings", False, "m28 and the next 10"),
     ],
 )
-def test_a_fault_of_one_robot_is_named_with_its_recording(kind, tagged, part, logs, twin):
+def test_fault_of_one_robot_names_its_recordings(kind, tagged, part, logs, twin):
     """Check that a fault in a third of the rows is named by tag or by when it drove."""
     owner = logs.episode % 3
     third = np.array([f"r{one}" for one in owner])
@@ -298,7 +298,7 @@ OF_ONE: dict[str | None, tuple[Plant, str]] = {
 
 
 @pytest.mark.parametrize("fault", OF_ONE)
-def test_a_fault_of_one_robot_is_named_and_nothing_else(logs, twin, fault):
+def test_fault_of_one_robot_is_the_only_finding(logs, twin, fault):
     plant, said = OF_ONE[fault]
     fleet, floors = _of_one(logs, plant), open_floors("default")
     found = diagnose_rows(fleet, twin, files={"r1": "monday.mcap"}, floors=floors)
@@ -414,7 +414,7 @@ PART_OF: dict[str | None, tuple[Plant, str]] = {
 
 
 @pytest.mark.parametrize("fault", PART_OF)
-def test_what_lasts_for_a_part_is_named_beside_other_robots(logs, twin, fault, monkeypatch):
+def test_partial_fault_is_found_beside_other_robots(logs, twin, fault, monkeypatch):
     monkeypatch.setattr(before_training, "MIN_ROWS", 300)
     plant, said = PART_OF[fault]
     robot = np.array([f"r{one}" for one in logs.episode % 4])
@@ -435,7 +435,7 @@ def test_what_lasts_for_a_part_is_named_beside_other_robots(logs, twin, fault, m
     assert [text for text in texts if said in text] or fault is None, texts
 
 
-def test_proposals_are_compared_in_the_units_of_observations(logs: FedRows) -> None:
+def test_proposals_are_compared_in_observation_units(logs: FedRows) -> None:
     """A robot of a quarter of the speed does the same, as observations are in units of that."""
     slow = tuple((speed / 4, turn / 4) for speed, turn in logs.task.actions)
     driven = replace(logs, driver=np.full(len(logs), "planner"))
@@ -446,7 +446,7 @@ def test_proposals_are_compared_in_the_units_of_observations(logs: FedRows) -> N
     assert shares[0] == shares[1] != []
 
 
-def test_a_check_in_many_parts_is_corrected_for_their_number():
+def test_checks_are_corrected_for_number_of_parts():
     interval = ConfidenceInterval(1.2, 1.09, 1.31)
     row = judged("gain: x", "", "ratio", interval, logs=1.2, twin=1.0, most=1.08, logs_rows=9)
     sound = judged("gain: x", "", "ratio", ConfidenceInterval(1.0, 0.9, 1.1), logs=1.0, twin=1.0,
@@ -468,7 +468,7 @@ def tuesday(tmp_path_factory: pytest.TempPathFactory) -> OpenedRows:
     return open_rows(store)
 
 
-def test_racks_elsewhere_than_on_the_twins_floor_are_named(tuesday):
+def test_moved_racks_are_reported(tuesday):
     def judged_on(floor: str, east_m: float) -> RowDiagnosis:
         assert tuesday.rows.pose is not None
         moved = replace(tuesday.rows, pose=tuesday.rows.pose + np.array([east_m, 0.0, 0.0]))
@@ -484,7 +484,7 @@ def test_racks_elsewhere_than_on_the_twins_floor_are_named(tuesday):
     assert "these logs are of another floor" in row.note
 
 
-def test_goals_of_other_missions_are_no_scale_of_the_plan(tuesday):
+def test_unpursued_goals_are_not_a_scaled_plan(tuesday):
     rows = tuesday.rows
 
     def away(held: Any, place: int) -> None:  # the robot drives away from them
@@ -498,7 +498,7 @@ def test_goals_of_other_missions_are_no_scale_of_the_plan(tuesday):
 
 
 @pytest.mark.parametrize("failed", [0.0, 1.0])
-def test_conditions_from_failures_alone_are_named(logs, failed):
+def test_conditions_chosen_by_outcome_are_reported(logs, failed):
     """Check the selection bias of near collisions that are kept only if they ended badly."""
     near = logs.episode % 3 == 0
     held = np.empty(len(logs), object)
@@ -510,7 +510,7 @@ def test_conditions_from_failures_alone_are_named(logs, failed):
 
 @pytest.mark.long
 @pytest.mark.parametrize("logged", ["ice", "random driver"])
-def test_ice_and_aimless_driving_are_no_faults(twin, logged, monkeypatch):
+def test_ice_and_random_driving_are_not_faults(twin, logged, monkeypatch):
     """Check that ice and aimless driving are not named as faults of a sensor."""
     if logged == "ice":
         monkeypatch.setattr(fed_rows, "KINDS", ("nominal", "wheel_slip"))
@@ -521,12 +521,12 @@ def test_ice_and_aimless_driving_are_no_faults(twin, logged, monkeypatch):
     assert not any(row.off for row in found.comparisons)
 
 
-def test_rows_that_say_little_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
+def test_few_rows_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
     few = logs.take(np.arange(len(logs)) < 200)
     assert diagnose_rows(few, twin).verdict != "HEALTHY"
 
 
-def test_one_episode_without_spread_is_not_a_broken_sensor(logs: FedRows, twin: FedRows) -> None:
+def test_small_spread_in_one_episode_is_undecided(logs: FedRows, twin: FedRows) -> None:
     """An ideal simulator, or a floor on which nothing happens: its sensors are not at fault."""
     place = logs.task.observation_names.index
     still = logs.observation.copy()
@@ -546,7 +546,9 @@ def test_one_episode_without_spread_is_not_a_broken_sensor(logs: FedRows, twin: 
     assert spread["calm in one"]["spread: accel_x"] == "undecided"
 
 
-def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_reports_findings_for_noise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Rows of pure noise: nothing follows from anything, and 'what' is said with its evidence."""
     store = write_store(tmp_path / "store", [recording_transitions(index) for index in (1, 2)])
     words = ["diagnose", str(store), "--no-twin"]
@@ -570,7 +572,7 @@ def checked(opened: OpenedRows) -> list[Comparison]:
     return [one.of(opened.rows) for one in opened.checks]
 
 
-def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None:
+def test_labels_and_ends_are_recomputed_from_signals(tmp_path: Path) -> None:
     logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")
@@ -596,7 +598,7 @@ def test_labels_and_ends_are_computed_again_from_signals(tmp_path: Path) -> None
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
 
 
-def test_labels_unknown_by_goals_in_hindsight_are_not_wrong(tmp_path: Path) -> None:
+def test_labels_unknown_in_hindsight_are_not_checked(tmp_path: Path) -> None:
     profile = load_profile(hindsight_profile(tmp_path))
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
     rule = {"name": "on_the_plan", "sql": "plan_gap_m > 0", "let": {}}
@@ -613,7 +615,7 @@ def test_labels_unknown_by_goals_in_hindsight_are_not_wrong(tmp_path: Path) -> N
     assert not {"labels: blocked_aisle", "labels: on_the_plan"} & set(checks)
 
 
-def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> None:
+def test_panel_is_compared_with_its_store(tmp_path: Path) -> None:
     """What was changed after mixing is what the critic is fed, and the store does not show it."""
     profile = load_profile("warehouse_amr")
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
@@ -651,7 +653,7 @@ def _rewrite(panel: Panel, **columns: list[Any]) -> None:
     ("of_run", "together"),
     [("HEALTHY", "BUFFER"), ("TARGET", "BOTH"), ("DIVERGENCE", "DIVERGENCE")],
 )
-def test_a_run_is_judged_with_its_rows(logs, twin, of_run, together):
+def test_run_verdict_includes_its_rows(logs, twin, of_run, together):
     alone = Diagnosis(of_run, [of_run], [], [], ["a figure"], "none needed")
     assert with_rows(alone, diagnose_rows(logs, twin)) == alone
     both = with_rows(alone, diagnose_rows(_swapped(logs), twin))

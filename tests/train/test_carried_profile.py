@@ -96,7 +96,7 @@ def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
     assert run.document["config"]["profile"] == "mine"
 
 
-def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, shell):
+def test_eval_and_resume_work_without_profile_file(folder, shell):
     drive = ["eval", str(folder / "run"), "--episodes", "nominal=1", "--perturbations", "none"]
     assert shell.json(*drive, "--policies", "agent")["results"]
     assert main(["report", str(folder / "run")]) == 0
@@ -110,7 +110,7 @@ def test_a_run_is_evaluated_and_resumed_without_its_profile(folder, shell):
     assert again.profile == resumed.profile
 
 
-def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, shell):
+def test_run_lists_conditions_the_twin_cannot_show(folder, shell):
     """What the twin's own signals say is evaluated there; logs keep their stored labels."""
     line = ["train", "--panel", str(folder / "panel"), "--out", str(folder / "dry"), *FLAGS]
     out, err = shell.printed(*line, "--dry-run")
@@ -139,7 +139,7 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(folder, shell):
         ("unknown = 1\n", "unknown"),
     ],
 )
-def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem):
+def test_carried_profile_is_as_restricted_as_a_file(folder, text, problem):
     whole = profile_toml(AMR).replace("condition = []\n", "")
     text = whole + text if "[[" in text else text + whole
     with pytest.raises(ConfigError, match=problem):
@@ -156,7 +156,7 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(folder, text, problem
     age_s=st.one_of(st.none(), st.floats(1e-9, 1e9)),
     values=st.dictionaries(st.text(), st.floats(allow_nan=False, allow_infinity=False)),
 )
-def test_a_profile_comes_back_from_its_text_as_it_was(doc, age_s, values):
+def test_profile_text_round_trips(doc, age_s, values):
     signal = CustomSignal("/a", "a/msg/B", "data", "V", max_age_s=age_s, values=values, doc=doc)
     profile = msgspec.structs.replace(AMR, signals={"voltage_v": signal}, doc=doc)
     assert parse_profile(profile_toml(profile), where="test") == profile

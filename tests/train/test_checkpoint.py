@@ -12,7 +12,7 @@ from restock.state import restored, saved
 from restock.train.run import checkpoint
 
 
-def test_everything_comes_back_exactly(tmp_path: Path) -> None:
+def test_state_round_trips_exactly(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     rng.random(5)
     state = {
@@ -45,7 +45,7 @@ def test_everything_comes_back_exactly(tmp_path: Path) -> None:
     assert other.random(8).tolist() == rng.random(8).tolist()
 
 
-def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path) -> None:
+def test_failed_write_keeps_old_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "latest.safetensors"
     checkpoint.save(path, {"step": 1})
     with pytest.raises(TypeError, match="agent/policy: object"):
@@ -54,7 +54,7 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["latest.safetensors"]
 
 
-def test_what_is_saved_is_a_copy(tmp_path: Path) -> None:
+def test_saved_tensors_are_copies(tmp_path: Path) -> None:
     weight = torch.zeros(2)
     checkpoint.save(tmp_path / "c", {"weight": weight, "same": weight})
     weight += 1
@@ -62,7 +62,7 @@ def test_what_is_saved_is_a_copy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"\x08" + b"\x00" * 7 + b"{}      "])
-def test_a_damaged_or_foreign_file_gives_one_clear_error(tmp_path: Path, content: bytes) -> None:
+def test_damaged_or_foreign_file_is_rejected(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "latest.safetensors"
     path.write_bytes(content)
     with pytest.raises(RunError, match=r"latest.safetensors: is (damaged|not a checkpoint)"):
@@ -70,7 +70,7 @@ def test_a_damaged_or_foreign_file_gives_one_clear_error(tmp_path: Path, content
 
 
 @pytest.mark.parametrize("at", [0.3, 0.7])
-def test_a_flipped_bit_is_found_and_its_remedy_said(tmp_path: Path, at: float) -> None:
+def test_flipped_bit_is_reported_with_remedy(tmp_path: Path, at: float) -> None:
     path = tmp_path / "latest.safetensors"
     checkpoint.save(path, {"weight": torch.arange(100.0)})
     content = bytearray(path.read_bytes())
@@ -80,7 +80,7 @@ def test_a_flipped_bit_is_found_and_its_remedy_said(tmp_path: Path, at: float) -
         checkpoint.load(path)
 
 
-def test_checkpoint_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_earlier_version_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "latest.safetensors"
     save_file({}, path, metadata={"format": "restock-checkpoint/1", "state": "{}"})
     with pytest.raises(RunError, match=r"by an earlier Restock .*\n.*train again with"):

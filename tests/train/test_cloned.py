@@ -50,7 +50,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
     return panel_of(write_store(folder / "store", tables, task=TASK), MIXTURE, folder / "panel")
 
 
-def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel, tmp_path):
+def test_clone_matches_drivers_and_reports_agreement(panel, tmp_path):
     run = Run.open(kept_run(tmp_path / "run", panel=panel))
     policy = load_cloned(run, "cloned", seed=3)
     reported = policy.quality
@@ -71,7 +71,7 @@ def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel, tmp_path):
     assert (load_cloned(run, "cloned", seed=4).act(None, observation)[0] != action).any()
 
 
-def test_a_clone_is_kept_and_not_trained_again(panel, tmp_path, monkeypatch):
+def test_clone_is_cached(panel, tmp_path, monkeypatch):
     run = Run.open(kept_run(tmp_path / "run", panel=panel))
     first = load_cloned(run, "cloned:teleop")
     assert first.quality.drivers == ["teleop"]
@@ -85,7 +85,7 @@ def test_a_clone_is_kept_and_not_trained_again(panel, tmp_path, monkeypatch):
     assert all((weights[name] == before[name]).all() for name in before)
 
 
-def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
+def test_clone_of_random_driver_is_poor(tmp_path: Path) -> None:
     tables = [driven_by_a_rule(recording, "teleop", chance=True) for recording in (1, 2)]
     store = write_store(tmp_path / "store", tables, task=TASK)
     panel = panel_of(store, MIXTURE, tmp_path / "panel")
@@ -99,7 +99,7 @@ def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
     assert "the quality of the clone is not known" in reported.text
 
 
-def test_eval_drives_and_compares_the_clone(panel, tmp_path, shell):
+def test_eval_drives_the_clone(panel, tmp_path, shell):
     run = kept_run(tmp_path / "run", panel=panel)
     line = ["eval", str(run), "--episodes", "nominal=2", "--perturbations", "none", "--json"]
     document = json.loads(shell.out(*line, "--policies", "agent,cloned"))
@@ -118,7 +118,7 @@ def test_eval_drives_and_compares_the_clone(panel, tmp_path, shell):
         ("cloned:", "there is no 'cloned:'"),
     ],
 )
-def test_a_clone_of_nobody_is_refused(panel, tmp_path, policy, said, shell):
+def test_clone_of_unknown_driver_is_rejected(panel, tmp_path, policy, said, shell):
     run = kept_run(tmp_path / "run", panel=panel)
     assert said in shell.err("eval", run, "--policies", policy, "--dry-run")
     none = kept_run(tmp_path / "none")

@@ -50,7 +50,7 @@ def rows_of_episodes() -> tuple[Coded, Coded, np.ndarray, np.ndarray]:
     return coded(drivers), coded(episodes), np.float32(reward), np.float32(discount)
 
 
-def test_successes_are_whole_episodes_without_the_teacher() -> None:
+def test_successes_exclude_episodes_with_teacher_steps() -> None:
     policy, episode, reward, discount = rows_of_episodes()
     found = rows_of_successes(policy, episode, reward, discount, ["operator"])
     assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "another's"}
@@ -70,7 +70,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
         return build_panel(store, load_mixture("coverage"), folder / "panel")
 
 
-def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -> None:
+def test_run_reports_cloned_rows_and_updates(panel: Panel, tmp_path: Path) -> None:
     requested = prepare_new(tmp_path / "run", panel.path, None).config.teacher
     assert requested.source == "operator"
     assert requested.successes is False
@@ -96,7 +96,7 @@ def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -
     assert fewer.config.teacher.offline_updates == round(100 * rows.sum() / 5000)
 
 
-def test_goals_in_hindsight_show_no_success(tmp_path: Path) -> None:
+def test_hindsight_goals_disable_cloning_of_successes(tmp_path: Path) -> None:
     settings = [f"profile={hindsight_profile(tmp_path)}"]
     assert prepare_new(tmp_path / "r", None, None, settings).config.teacher.successes is False
     with pytest.raises(ConfigError, match=r"teacher\.successes: goals are found in hindsight"):

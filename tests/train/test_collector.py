@@ -32,7 +32,7 @@ def collecting(n_step: int) -> Collector:
     return collector
 
 
-def test_truncated_episodes_bootstrap_at_their_last_step():
+def test_truncated_episodes_bootstrap_at_last_step():
     """The ring's rows of three steps against the single steps that the twin returned."""
     made, rng = collecting(n_step=3), np.random.default_rng(0)
     step_of: dict[tuple[int, int], tuple[Any, ...]] = {}
@@ -65,7 +65,7 @@ def test_truncated_episodes_bootstrap_at_their_last_step():
         assert ring.meta["horizon"][slot] == horizon
 
 
-def test_a_step_whose_physics_blew_up_leaves_the_row_before_it(monkeypatch):
+def test_diverged_step_repeats_previous_row(monkeypatch):
     made = collecting(n_step=1)
     simulation = made.env.simulation
     drive = simulation.drive

@@ -52,7 +52,7 @@ def test_feeds_of_one_process_are_comparable() -> None:
     assert verdict(feed(1, runs=5), feed(2, runs=5)) == "comparable"
 
 
-def test_a_feed_against_itself_is_never_incomparable() -> None:
+def test_feed_is_not_incomparable_with_itself() -> None:
     few = feed(1, fresh_episodes=100)
     assert verdict(few, few) != "incomparable"
 
@@ -67,7 +67,7 @@ def test_few_episodes_of_one_process_are_inconclusive() -> None:
     assert "comparable" not in verdicts
 
 
-def test_the_rarest_stratum_halved_is_found() -> None:
+def test_halved_rare_stratum_is_found() -> None:
     found = failing(feed(1, runs=5), feed(2, logs=(0.7, 0.299, 0.001), runs=5))
     (raw,) = found
     assert raw.name == "share of logs/rare"
@@ -86,14 +86,14 @@ FEW = {f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")}
         ({"log_episodes": 40}, FEW, FEW),
     ],
 )
-def test_what_is_planted_is_found(planted, least, most) -> None:
+def test_planted_difference_is_found(planted, least, most) -> None:
     names = {check.name for check in failing(feed(1, runs=5), feed(2, runs=5, **planted))}
     assert names >= least
     assert most is None or names <= most
     assert "weight" not in planted or all("after weights" in name for name in names)
 
 
-def test_a_shift_within_the_run_that_the_whole_hides_is_found() -> None:
+def test_shift_within_run_is_found() -> None:
     first, second = feed(1, runs=5), feed(2, runs=5)
     amounts = second.drawn.copy()
     for tenth, times in ((0, 1.5), (9, 0.5)):  # early more slip, late less
@@ -106,7 +106,7 @@ def test_a_shift_within_the_run_that_the_whole_hides_is_found() -> None:
     assert parts == {"tenth 1", "tenth 10"}
 
 
-def test_rows_that_nobody_could_label_show_nothing() -> None:
+def test_unlabelled_rows_are_inconclusive() -> None:
     first, second = feed(1, runs=5), feed(2, runs=5)
     names = [name.replace("fresh/nominal", "fresh/unlabelled") for name in CELLS]
     unknown = [dataclasses.replace(one, cells=names) for one in (first, second)]

@@ -31,7 +31,7 @@ def compared(
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
+def test_algorithms_with_equal_feeds_are_compared(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3), success=0.2, update_path="manual")
     other = {
         "config__network__layer_norm": False,
@@ -61,7 +61,7 @@ def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
         ({"task_hash": "u"}, "task_hash"),
     ],
 )
-def test_what_the_treatment_does_not_name_may_not_differ(tmp_path, capsys, changes, setting):
+def test_differences_outside_the_treatment_are_refused(tmp_path, capsys, changes, setting):
     first = arm(tmp_path, "a", range(1))
     second = [str(make_run(tmp_path / "b", document(1, **changes)))]
     code, found = compared(capsys, first, second)
@@ -69,7 +69,7 @@ def test_what_the_treatment_does_not_name_may_not_differ(tmp_path, capsys, chang
     assert found["outcomes"] == []
 
 
-def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) -> None:
+def test_different_feed_needs_mixture_treatment(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     second = arm(tmp_path, "b", range(3, 6), slip_share=0.15)
     code, found = compared(capsys, first, second)
@@ -84,7 +84,7 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
     assert (code, found["verdict"]) == (0, "comparable")
 
 
-def test_replay_and_practice_may_differ_as_data(tmp_path, capsys) -> None:
+def test_data_treatment_allows_replay_and_practice(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(1))
     second = arm(tmp_path, "b", range(1), slip_share=0.15, config__practice__rule="even")
     for treatment in ("mixture", "practice"):
@@ -96,7 +96,7 @@ def test_replay_and_practice_may_differ_as_data(tmp_path, capsys) -> None:
     assert compared(capsys, first, third, "--treatment", "data")[0] == 1
 
 
-def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
+def test_run_with_half_the_updates_is_incomparable(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(1))
     second = [str(make_run(tmp_path / "b", document(1), updates=UPDATES // 2))]
     code, found = compared(capsys, first, second, "--treatment", "mixture")
@@ -105,7 +105,7 @@ def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
     assert (check["value"], check["verdict"]) == (2.0, "incomparable")
 
 
-def test_without_a_goal_no_success_is_compared(tmp_path, capsys) -> None:
+def test_task_without_goal_has_no_success(tmp_path, capsys) -> None:
     first, second = (
         arm(tmp_path, n, range(k, k + 3), success=None) for n, k in (("a", 0), ("b", 3))
     )
@@ -135,7 +135,7 @@ def test_few_episodes_are_inconclusive(tmp_path, capsys) -> None:
         (3, 40, "every run ended every episode in the same way: nothing varies"),
     ],
 )
-def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, episodes, why) -> None:
+def test_few_runs_or_episodes_give_no_interval(tmp_path, capsys, seeds, episodes, why) -> None:
     given = {"episodes": episodes, "fresh_episodes": 400}  # of a feed that may differ
     first = arm(tmp_path, "a", range(seeds), success=2.0, **given)
     second = arm(tmp_path, "b", range(3, 3 + seeds), success=-1.0, **given)
@@ -147,7 +147,7 @@ def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, epis
         assert row["no_interval"] == why
 
 
-def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
+def test_invalid_arm_is_rejected(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     other = str(make_run(tmp_path / "o", document(9, config__target__tau=0.1)))
     young = str(Run.create(tmp_path / "young", document(1)).path)
@@ -168,7 +168,7 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
         assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_runs_that_are_not_independent_seeds_are_refused(tmp_path, capsys) -> None:
+def test_dependent_seeds_are_rejected(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(2))
     second = arm(tmp_path, "b", range(2, 4), config__network__layer_norm=False)
     copied = str(shutil.copytree(first[0], tmp_path / "copied"))

@@ -36,19 +36,19 @@ from restock.train.prepare import prepare_new
         ("schedule.updates_per_env_step=1e9", r"must be in \(0, 1000\], got 1000000000"),
     ],
 )
-def test_a_value_out_of_range_is_named_with_its_range(override: str, message: str) -> None:
+def test_out_of_range_value_reports_its_range(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(None, [override])
 
 
-def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
+def test_target_override_keeps_the_rule(tmp_path: Path) -> None:
     assert load_config(None, ["target.tau=0.02"]).target == Polyak(tau=0.02)
     hard = tmp_path / "hard.toml"
     hard.write_text('target = {rule = "hard", every = 7}\n')
     assert load_config(hard, ["target.every=9"]).target == Hard(every=9)
 
 
-def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> None:
+def test_error_names_config_file_or_set_option(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("seed = 1\n")
     with pytest.raises(ConfigError, match=r"^--set: seed must be in"):
@@ -76,13 +76,13 @@ def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> 
         ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
     ],
 )
-def test_impossible_run_is_refused_before_its_folder_is_made(tmp_path, override, message):
+def test_impossible_run_creates_no_folder(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, None, [override])
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
+def test_failed_start_leaves_no_folder(tmp_path, monkeypatch):
     def refuse(*_: Any, **__: Any) -> None:
         raise MemoryError
 
@@ -93,7 +93,7 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-def test_renamed_key_is_refused_with_new_name(tmp_path: Path) -> None:
+def test_renamed_key_is_rejected_with_remedy(tmp_path: Path) -> None:
     old = tmp_path / "old.toml"
     old.write_text("[network]\nensemble = 3\n")
     for path, overrides in ((old, []), (None, ["network.ensemble=3"])):
@@ -102,7 +102,7 @@ def test_renamed_key_is_refused_with_new_name(tmp_path: Path) -> None:
         assert "--to run" in str(refused.value)
 
 
-def test_the_default_shares_are_those_of_the_environment_itself() -> None:
+def test_default_shares_match_gymnasium_environment() -> None:
     trained: Any = make_twin(TrainConfig(), load_profile("warehouse_amr"), 2)
     made: Any = gymnasium.make_vec("restock/Warehouse-v0", num_envs=2)
     try:

@@ -52,14 +52,14 @@ def _append(run: Run, step: int, cell: tuple[str, str], number: int, success: bo
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=9), st.floats(0, 1))
-def test_the_area_is_between_the_least_and_the_most(values: list[float], level: float) -> None:
+def test_area_lies_between_min_and_max(values: list[float], level: float) -> None:
     steps = np.cumsum(np.arange(1, len(values) + 1)).astype(float)
     found = area(steps, np.array(values))
     assert min(values) - 1e-9 <= found <= max(values) + 1e-9
     assert area(steps, np.full(len(values), level)) == pytest.approx(level)
 
 
-def test_blocked_aisles_count_by_half_each_whatever_was_drawn(tmp_path: Path) -> None:
+def test_partial_and_full_blocks_weigh_equally(tmp_path: Path) -> None:
     run = RunCurve(curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}))
     assert run.value("auc_blocked_aisle") == 0.5  # one partly blocked, three wholly
     assert run.value("auc_partly_blocked") == 0.0
@@ -69,7 +69,7 @@ def test_blocked_aisles_count_by_half_each_whatever_was_drawn(tmp_path: Path) ->
     assert alone.value("auc_blocked_aisle") == 0.0
 
 
-def test_curves_are_compared_over_the_steps_that_all_have(tmp_path: Path) -> None:
+def test_curves_are_compared_over_common_steps(tmp_path: Path) -> None:
     whole = RunCurve(curve(tmp_path / "a", 0, {0: 0.0, 100: 1.0, 200: 1.0}))
     late = RunCurve(curve(tmp_path / "b", 0, {100: 0.5, 200: 0.5}))
     found = contrast("a", "b", "auc_wheel_slip", [(whole, late)])
@@ -95,7 +95,7 @@ def finish(plan: StudyPlan, ahead: tuple[float, ...]) -> None:
         job.done.write_text(plan.fingerprint(job))
 
 
-def test_a_study_adjusts_all_but_its_primary_contrast(tmp_path: Path) -> None:
+def test_holm_adjusts_all_but_primary_contrast(tmp_path: Path) -> None:
     plan = study(tmp_path)
     finish(plan, (0.2, 0.4, 0.4, 0.2))
     first, *others = contrasts(plan, set())
@@ -126,7 +126,7 @@ def driven(policy: str, success: float, time_s: float) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
 
 
-def test_the_page_has_contrasts_then_success_and_safety(tmp_path: Path) -> None:
+def test_study_page_lists_contrasts_and_safety(tmp_path: Path) -> None:
     text = STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]").replace("auc_wheel_slip", "success_rare")
     plan = study(tmp_path, text)
     for job in plan.jobs:

@@ -118,18 +118,18 @@ def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> No
         ({"every": 450, "lags": (1.2, 1.15, 1.1, 1.0), "target": Polyak(tau=3e-5)}, "TARGET"),
     ],
 )
-def test_symptoms_are_named(tmp_path: Path, symptoms: dict[str, Any], cause: str) -> None:
+def test_symptoms_give_expected_cause(tmp_path: Path, symptoms: dict[str, Any], cause: str) -> None:
     assert diagnose([make_run(tmp_path / "r", **symptoms)]).cause == cause
 
 
-def test_most_seeds_must_agree(tmp_path: Path) -> None:
+def test_cause_needs_majority_of_seeds(tmp_path: Path) -> None:
     slow = [make_run(tmp_path / f"s{n}", lag=0.9, seed=n) for n in range(2)]
     well = [make_run(tmp_path / f"w{n}", seed=n) for n in range(2, 4)]
     assert diagnose([*slow, well[0]]).cause == "TARGET"
     assert diagnose([*slow, *well]).cause == "UNDETERMINED"
 
 
-def test_runs_that_are_not_seeds_of_one_recipe_are_refused(tmp_path, capsys) -> None:
+def test_unrelated_runs_are_rejected(tmp_path, capsys) -> None:
     run = str(make_run(tmp_path / "r").path)
     same_seed = str(make_run(tmp_path / "s", windows=3).path)
     recipe = str(make_run(tmp_path / "t", target=Hard(1000), seed=1).path)
@@ -139,7 +139,9 @@ def test_runs_that_are_not_seeds_of_one_recipe_are_refused(tmp_path, capsys) -> 
         assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_diagnose_prints_cause_and_confirmation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     make_run(tmp_path / "r", gap={"blocked_aisle": 6.0})
     assert main(["diagnose", str(tmp_path / "r")]) == 0
     shown = capsys.readouterr().out
@@ -151,7 +153,7 @@ def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(document["runs"][0]["windows"]) == 4
 
 
-def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_undiagnosable_input_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Run.create(tmp_path / "young", {"config": msgspec.to_builtins(TrainConfig())})
     make_run(tmp_path / "well")
     early = make_run(tmp_path / "early")  # stopped before a batch was audited
@@ -177,7 +179,7 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
     [(Polyak(tau=0.01), 0.04), (Hard(400), 0.02), (Hard(10**6), 0.005), (Polyak(tau=1.0), 0.005)],
 )
 @pytest.mark.parametrize("cause", ["TARGET", "BOTH"])
-def test_the_experiment_on_a_target_changes_its_rule(tmp_path, rule, tau, cause):
+def test_target_experiment_changes_target_rule(tmp_path, rule, tau, cause):
     run = make_run(tmp_path / "r", lag=0.9, every=5000, target=rule)
     changed = parse_config(
         apply_overrides(run.document["config"], swapped(run, cause)), where="test"
@@ -186,7 +188,7 @@ def test_the_experiment_on_a_target_changes_its_rule(tmp_path, rule, tau, cause)
     assert f"{changed.target} in place of {rule}" in diagnose([run]).experiment
 
 
-def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
+def test_confirm_does_not_overwrite_a_run(tmp_path: Path, capsys) -> None:
     run = str(make_run(tmp_path / "r", lag=0.9).path)
     assert main(["diagnose", run, "--confirm", run]) == 2
     shown = capsys.readouterr()
@@ -197,7 +199,7 @@ def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.parametrize("source", ["none", "planner"])
-def test_an_experiment_repeats_a_run_without_a_teacher(source, tmp_path, monkeypatch):
+def test_confirm_repeats_run_without_operator_teacher(source, tmp_path, monkeypatch):
     """Its config has the other settings of `teacher`, resolved, which nobody may give."""
     run = make_run(tmp_path / "r", lag=0.9)
     run.document["config"]["teacher"] |= {"source": source, "successes": False, "ratio": 0.2}
@@ -222,7 +224,7 @@ def test_an_experiment_repeats_a_run_without_a_teacher(source, tmp_path, monkeyp
         ({"windows": 2}, "UNDETERMINED", None),
     ],
 )
-def test_of_two_faults_the_target_is_answered_for(tmp_path, monkeypatch, after, cause, confirmed):
+def test_confirm_of_two_faults_tests_the_target(tmp_path, monkeypatch, after, cause, confirmed):
     run = make_run(tmp_path / "r", lag=0.9, gap={"blocked_aisle": 6.0})
     found = diagnose([run])
     assert found.cause == "BOTH"
@@ -243,7 +245,7 @@ def test_of_two_faults_the_target_is_answered_for(tmp_path, monkeypatch, after, 
 
 
 @pytest.mark.parametrize("cause", ["BUFFER", "TARGET", "DIVERGENCE"])
-def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None:
+def test_experiment_changes_only_the_suspect(tmp_path: Path, cause: Any) -> None:
     run = make_run(tmp_path / "r")
     config = run.document["config"]
     changed = parse_config(apply_overrides(config, swapped(run, cause)), where="test")

@@ -17,7 +17,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.missions import KINDS
 
 
-def test_a_policy_of_another_task_is_refused(tmp_path, shell):
+def test_policy_of_another_task_is_rejected(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     other = kept_run(tmp_path / "b", profile="turtlebot3")
     assert "was trained on task" in shell.err(
@@ -27,7 +27,7 @@ def test_a_policy_of_another_task_is_refused(tmp_path, shell):
     assert "was trained on task" in shell.err(*record, "--policy", f"run:{other}")
 
 
-def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys, shell):
+def test_floor_is_evaluated_on_kinds_that_fit(tmp_path, capsys, shell):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -45,7 +45,7 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(tmp_path, capsys, shell):
     assert "has no room for episodes of nominal" in shell.err(*line)
 
 
-def test_what_was_recorded_is_shown_again_or_its_lack_is_said(tmp_path, shell):
+def test_zero_episodes_shows_recorded_evaluation(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "0", "--json"]
     said = " ".join(shell.err(*line).split())
@@ -63,7 +63,7 @@ def test_what_was_recorded_is_shown_again_or_its_lack_is_said(tmp_path, shell):
 
 
 @pytest.mark.long
-def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, shell):
+def test_evaluations_accumulate_and_newest_is_shown(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
@@ -87,7 +87,7 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(tmp_path, shell):
     assert shell.json("sql", run, "SELECT count(*) AS n FROM eval_episodes") == [{"n": 5}]
 
 
-def test_references_drive_the_same_missions(tmp_path, shell):
+def test_time_lost_is_relative_to_planner(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
     line += ["--episodes", "nominal=1"]
@@ -108,7 +108,7 @@ def test_references_drive_the_same_missions(tmp_path, shell):
     assert alone["random", "nominal"]["time_lost_s"] is None  # it did not arrive
 
 
-def test_episodes_may_be_asked_for_by_kind(tmp_path, shell):
+def test_episodes_per_kind(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--policies", "agent", "--perturbations", "none", "--dry-run"]
     planned = json.loads(shell.out(*line, "--episodes", "nominal=1000, wheel_slip=300"))
@@ -122,7 +122,7 @@ def test_episodes_may_be_asked_for_by_kind(tmp_path, shell):
         assert said in " ".join(shell.err(*line, "--episodes", wrong).split())
 
 
-def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
+def test_seeds_that_selected_the_policy_are_warned_about(tmp_path: Path) -> None:
     run = kept_run(tmp_path / "a")  # its evaluation's seeds are 90000 to 90009
     assert plan_evaluation(run, episodes=1000).warnings == []
     assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []

@@ -44,13 +44,13 @@ def drive(env: ToyTwin, action: int, specs: list[EpisodeSpec]) -> list[EpisodeRe
 SPECS = fixed_episodes(["nominal", "wheel_slip"], 7, 100)
 
 
-def test_results_do_not_depend_on_how_many_run_at_once() -> None:
+def test_results_do_not_depend_on_num_envs() -> None:
     alone = drive(ToyTwin(1), 1, SPECS)
     assert alone == drive(ToyTwin(4), 1, SPECS) == drive(ToyTwin(64), 1, SPECS)
     assert len({result.time_s for result in alone}) > 2  # slipping ones take longer, each its own
 
 
-def test_an_episode_is_counted_by_hand() -> None:
+def test_episode_result_matches_hand_calculation() -> None:
     (result,) = drive(ToyTwin(2), 1, [EpisodeSpec("nominal", 5)])
     assert result.success
     assert result.failure is None
@@ -66,7 +66,7 @@ def test_an_episode_is_counted_by_hand() -> None:
     assert result.bumps == 0
 
 
-def test_a_contact_that_lasts_is_one_bump() -> None:
+def test_lasting_contact_counts_as_one_bump() -> None:
     (result,) = drive(ToyTwin(1), 2, [EpisodeSpec("nominal", 5)])  # backs into the wall, 20 steps
     assert result.bumps == 1
     assert not result.success
@@ -88,7 +88,7 @@ def test_score_weighs_conditions_equally_then_return() -> None:
     assert not Score({}, 0.4, 9.0).beats(found)
 
 
-def test_the_summary_tells_partial_and_full_blocks_apart() -> None:
+def test_summary_separates_partial_and_full_blocks() -> None:
     def result(block: str, success: bool) -> EpisodeResult:
         condition = "nominal" if block == "none" else "blocked_aisle"
         return EpisodeResult(condition, block, 0, success, 1, 3.0, 2.0, 0.0, 0.0, None)
@@ -118,7 +118,7 @@ def came_to(results: list[EpisodeResult]) -> dict[str, Any]:
     return measures([{**one.row, "time_lost_s": None} for one in results])
 
 
-def test_bumps_are_counted_by_the_kilometre_driven() -> None:
+def test_bump_rate_is_per_kilometre() -> None:
     far = drove(1, True, 30.0, distance_m=1500.0)
     near = drove(2, False, 1.0, bumps=1, distance_m=500.0, closest_person_m=0.2)
     row = came_to([far, near])

@@ -10,7 +10,7 @@ from restock.errors import PanelError
 from restock.train.run.run_profile import run_panel
 
 
-def test_another_panel_in_its_place_is_refused(tmp_path: Path) -> None:
+def test_replaced_panel_is_rejected(tmp_path: Path) -> None:
     store, out = write_store(tmp_path / "store", [recording_transitions(1)]), tmp_path / "panel"
     fed = panel_of(store, EVERY + NO_SPLIT, out)
     document = {"panel": {"path": str(out), "id": fed.id}}

@@ -25,7 +25,7 @@ def row(condition: str, seed: int, policy: str, success: bool, returned: float) 
     }
 
 
-def test_the_worst_failure_and_the_best_rescue_of_each_condition() -> None:
+def test_scenes_are_worst_failures_and_best_rescues() -> None:
     rows = [
         row("wheel_slip", 1, "agent", False, -1.0),
         row("wheel_slip", 2, "agent", False, -3.0),
@@ -54,7 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
+def test_repeated_episode_matches_record(run: Path) -> None:
     plan = plan_evaluation(run, policies=("agent",), episodes=KINDS)
     for recorded in read_evaluations(run).to_pylist()[:2]:
         result, frames = drive_again(plan, recorded)
@@ -63,7 +63,7 @@ def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
         assert len(frames) == round(recorded["time_s"] / 0.2) + 1
 
 
-def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(run, shell):
+def test_films_show_only_reproduced_episodes(run, shell):
     table = read_evaluations(run)
     rows = table.to_pylist()
     for one in rows:  # as if another episode had been recorded

@@ -30,7 +30,7 @@ def rows(run: Session, query: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_only_rows_of_unended_episodes_have_no_condition(live: Session) -> None:
+def test_only_rows_of_open_episodes_lack_a_condition(live: Session) -> None:
     (whole,) = rows(
         live,
         "SELECT count(*) AS fresh, count(*) FILTER (condition IS NULL) AS unknown,"
@@ -58,7 +58,7 @@ def test_only_rows_of_unended_episodes_have_no_condition(live: Session) -> None:
         ("actions", "condition", "drawn_rows"),
     ],
 )
-def test_every_table_counts_the_same_rows(live, table, condition, measure):
+def test_tables_agree_on_drawn_rows(live, table, condition, measure):
     every = live.config.record.every_updates
     assert rows(
         live,
@@ -74,7 +74,7 @@ def test_every_table_counts_the_same_rows(live, table, condition, measure):
     )
 
 
-def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:
+def test_actions_table_counts_drawn_and_greedy_actions(live: Session) -> None:
     per_cell = rows(
         live,
         "SELECT source, condition, action, name, sum(drawn_rows)::BIGINT AS drawn,"
@@ -110,7 +110,7 @@ def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:
 
 
 @given(st.data())
-def test_labels_reach_their_rows_whatever_their_order(data: st.DataObject) -> None:
+def test_labels_reach_rows_in_any_order(data: st.DataObject) -> None:
     lengths = data.draw(st.dictionaries(st.integers(0, 30), st.integers(1, 9), max_size=8))
     known = data.draw(st.sets(st.sampled_from(sorted(lengths)))) if lengths else set()
     lost = data.draw(st.sets(st.integers(31, 35)))

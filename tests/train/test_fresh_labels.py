@@ -17,7 +17,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 CONDITIONS = load_profile("warehouse_amr").conditions
 
 
-def test_labels_from_infos_equal_those_of_whole_episodes() -> None:
+def test_labels_from_infos_match_episode_labels() -> None:
     made: Any = gymnasium.make("restock/Warehouse-v0").unwrapped
     kinds = ("blocked_aisle", "near_collision", "wheel_slip")
     made.vector.set_episodes([EpisodeSpec(kind, seed) for seed, kind in enumerate(kinds)])

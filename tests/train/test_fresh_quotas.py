@@ -39,7 +39,7 @@ SITUATIONS = by_priority(EXPOSURES)
 
 
 @pytest.mark.parametrize("text", [OF_STEPS, OF_EPISODES, TWO_STEPS, SITUATIONS])
-def test_fresh_episodes_get_the_strata_that_logged_ones_get(text: str, tmp_path: Path) -> None:
+def test_fresh_and_logged_episodes_get_equal_strata(text: str, tmp_path: Path) -> None:
     mixture = parse_mixture(f"evaluation_split = {{by = 'none'}}\nuncertain = 'keep'\n{text}")
     conditions = [*CONDITIONS, *EXPOSURES]
     panel = build_panel(TABLE, mixture, tmp_path / "panel", conditions=conditions)
@@ -65,7 +65,7 @@ def test_fresh_episodes_get_the_strata_that_logged_ones_get(text: str, tmp_path:
     assert same == len(TABLE)
 
 
-def test_episode_of_several_strata_goes_to_the_smallest() -> None:
+def test_episode_of_several_strata_joins_smallest() -> None:
     mixture = parse_mixture("[each_condition]\nshare = 'equal'\nunit = 'episode'\n")
     names = ["nominal", "recovery", "wheel_slip"]
     strata = FreshStrata(mixture, names, [c for c in CONDITIONS if c.name in names])
@@ -78,7 +78,7 @@ def test_episode_of_several_strata_goes_to_the_smallest() -> None:
 
 @settings(max_examples=30)
 @given(st.data())
-def test_every_step_is_in_a_stratum_whose_condition_holds(data: st.DataObject) -> None:
+def test_step_stratum_matches_its_conditions(data: st.DataObject) -> None:
     mixture = parse_mixture(data.draw(st.sampled_from([OF_STEPS, OF_EPISODES])))
     names = ["nominal", *(c.name for c in CONDITIONS)]
     strata = FreshStrata(mixture, names, CONDITIONS)
@@ -94,7 +94,7 @@ def test_every_step_is_in_a_stratum_whose_condition_holds(data: st.DataObject) -
             assert found.any() if of_episode else found[step]
 
 
-def test_stratum_without_fresh_rows_is_reported_as_short(tmp_path: Path) -> None:
+def test_stratum_of_logged_columns_has_no_fresh_rows(tmp_path: Path) -> None:
     text = (
         "unlisted = 'drop'\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
         "[[strata]]\nname = 'first'\nwhere = 'step_index < 2'\nshare = 0.5\n"
@@ -125,7 +125,7 @@ def fed_by(panel: Panel, settings: Any = SETTINGS) -> Logs:
     return Logs.of_panel(panel, planned_draws(settings))
 
 
-def test_a_run_is_fed_its_quotas_from_logs_and_ring(panel: Panel, tmp_path: Path) -> None:
+def test_quotas_are_filled_from_logs_and_ring(panel: Panel, tmp_path: Path) -> None:
     """The logged rows bear a small part of the online draws: the ring gives the rest."""
     live = run_to_end(tmp_path / "a", SETTINGS, logs=fed_by(panel))
     nominal, slip = [row for row in fed_shares(live.run) if row["stratum"] != "unlabelled"]
@@ -167,7 +167,7 @@ def audited(run: Path) -> list[dict[str, Any]]:
         return [dict(zip(found.columns, row, strict=True)) for row in found.fetchall()]
 
 
-def test_a_stratum_without_rows_is_named_before_and_after(tmp_path: Path) -> None:
+def test_shortfall_is_reported_after_training(tmp_path: Path) -> None:
     """Nothing slips in the twin, and few logged rows do."""
     rows = recording_transitions(1, task=TOY_TASK, episodes=60)
     text = QUOTAS.replace("max_replays_per_row = 8", "max_replays_per_row = 1")
@@ -192,7 +192,7 @@ def test_a_stratum_without_rows_is_named_before_and_after(tmp_path: Path) -> Non
     assert row["drawn_share"] < 0.5 * row["wanted_share"]
 
 
-def test_a_budget_in_seconds_counts_the_evaluations(tmp_path: Path) -> None:
+def test_seconds_budget_includes_evaluations(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config(schedule={"seconds": 100.0}))
     live.learner.gradient_steps = live.config.record.every_updates
     live.progress.wall_s = 60.0
@@ -203,7 +203,7 @@ def test_a_budget_in_seconds_counts_the_evaluations(tmp_path: Path) -> None:
     live.close()
 
 
-def test_a_budget_too_short_for_an_evaluation_is_refused(tmp_path: Path) -> None:
+def test_too_short_seconds_budget_is_rejected(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config())
     with pytest.raises(ConfigError, match="an evaluation of 6 episodes takes about") as raised:
         refuse_short_budget(live, 1e-9)
@@ -213,7 +213,7 @@ def test_a_budget_too_short_for_an_evaluation_is_refused(tmp_path: Path) -> None
     live.close()
 
 
-def test_a_budget_in_seconds_is_planned_from_the_measured_speed(panel, tmp_path):
+def test_seconds_budget_uses_measured_speed(panel, tmp_path):
     settings = config(
         replay={"logs_share": None}, schedule={"seconds": 100.0, "env_steps": 10_000_000}
     )
@@ -238,13 +238,13 @@ def test_a_budget_in_seconds_is_planned_from_the_measured_speed(panel, tmp_path)
     again.close()
 
 
-def test_planned_draws_of_a_run() -> None:
+def test_planned_draws_by_hand() -> None:
     settings = config(schedule={"env_steps": 1_000, "seconds": None})
     assert planned_draws(settings) == PlannedDraws(60 * 32, 800 * 0.25 * 32, 200, 1_000)
     assert planned_draws(settings, 600) == PlannedDraws(60 * 32, 400 * 0.25 * 32, 200, 600)
 
 
-def test_mix_speaks_of_the_default_training_budget() -> None:
+def test_mix_assumes_default_training_budget() -> None:
     planned, (updates, batch_size) = planned_draws(TrainConfig()), TRAINING
     assert updates * batch_size == planned.offline + planned.online
     assert batch_size == TrainConfig().replay.batch_size

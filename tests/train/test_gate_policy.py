@@ -57,7 +57,7 @@ def spoilt(spec: EpisodeSpec, own: bool) -> bool:
     return often(spec, own) and not (own and spec.condition == "wheel_slip" and spec.seed % 2)
 
 
-def test_equal_policies_pass_before_the_budget(run: Path, driven: Any) -> None:
+def test_equal_policies_pass_before_budget_is_spent(run: Path, driven: Any) -> None:
     driven(often)
     assert main(["gate", str(run), "--baseline", "planner"]) == 0
     document = json.loads((run / "gate" / "gate.json").read_text())
@@ -74,7 +74,7 @@ def test_equal_policies_pass_before_the_budget(run: Path, driven: Any) -> None:
     assert "was not measured" in page  # the twin's gap
 
 
-def test_a_policy_spoilt_in_one_condition_is_named(run, driven, shell):
+def test_worse_condition_is_named(run, driven, shell):
     driven(spoilt)
     document = shell.json("gate", run, "--baseline", "planner", code=1)
     verdicts = {cell["condition"]: cell["verdict"] for cell in document["cells"]}
@@ -83,7 +83,7 @@ def test_a_policy_spoilt_in_one_condition_is_named(run, driven, shell):
     assert "worse in wheel slip" in document["claim"]
 
 
-def test_a_spent_budget_shows_nothing(run: Path, driven: Any) -> None:
+def test_spent_budget_is_inconclusive(run: Path, driven: Any) -> None:
     driven(
         lambda spec, own: bool(
             np.random.default_rng(2 * spec.seed + own).random() < 0.6 - 0.1 * own
@@ -96,7 +96,7 @@ def test_a_spent_budget_shows_nothing(run: Path, driven: Any) -> None:
     assert 160 <= cell["pairs"] < 160 + gate.ROUND
 
 
-def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
+def test_each_requested_measure_gets_a_verdict(run: Path, driven: Any) -> None:
     """A policy that arrives as often but bumps more fails by bumps alone."""
     driven(often)
     margins = {"bumps_per_km": 5.0, "time_lost_s": 2.0, "closest_person_m": 0.2}
@@ -122,19 +122,19 @@ def test_each_measure_that_is_asked_is_judged(run: Path, driven: Any) -> None:
         (["--baseline", "nobody"], "--policies"),
     ],
 )
-def test_what_cannot_give_a_verdict_is_refused(run, options, where, shell):
+def test_invalid_gate_options_are_rejected(run, options, where, shell):
     base = [] if "--baseline" in options else ["--baseline", "planner"]
     assert shell.err("gate", run, *base, *options).startswith(f"restock: {where}: ")
     assert not (run / "gate").exists()
 
 
-def test_a_floor_without_room_for_a_condition_is_refused(run: Path, tmp_path: Path) -> None:
+def test_floor_too_small_for_a_condition_is_rejected(run: Path, tmp_path: Path) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
     assert main(["gate", str(run), "--baseline", "planner", "--layouts", str(hall)]) == 2
 
 
-def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, shell):
+def test_untrusted_twin_is_rejected(run, monkeypatch, shell):
     class Gap:
         untrusted = ("wheel_slip",)
         verdicts = ()
@@ -144,7 +144,7 @@ def test_a_twin_that_is_not_trusted_gives_no_verdict(run, monkeypatch, shell):
     assert plan_gate(run, "planner", conditions=("nominal",)).gap is not None
 
 
-def test_an_interrupted_run_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_run_is_rejected(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Origin:
         env_steps, run_env_steps, text = 20_000, 50_000, "policy of step 20,000 of 50,000"
 
@@ -155,7 +155,7 @@ def test_an_interrupted_run_is_refused(run: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_the_planner_is_not_worse_than_itself_in_the_twin(run, monkeypatch):
+def test_planner_passes_gate_against_itself(run, monkeypatch):
     from restock.train.evaluation.eval_run import reference
 
     monkeypatch.setattr(gate, "make_policy", lambda name, plan: reference("planner"))

@@ -34,7 +34,7 @@ def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
 
 @settings(max_examples=60)
 @given(TABLES, st.data())
-def test_gives_the_rows_in_order(table: np.ndarray, data: st.DataObject) -> None:
+def test_rows_are_gathered_in_order(table: np.ndarray, data: st.DataObject) -> None:
     rows = torch.from_numpy(table)
     numbers = data.draw(st.lists(st.integers(0, len(table) - 1), max_size=20))
     index = torch.tensor(numbers, dtype=torch.int64)
@@ -43,7 +43,7 @@ def test_gives_the_rows_in_order(table: np.ndarray, data: st.DataObject) -> None
     assert same(given, rows, index)
 
 
-def test_a_gather_keeps_every_bit() -> None:
+def test_gather_preserves_bits() -> None:
     bits = np.array([0x80000000, 0x7FC00001, 0x00000001, 0xFF800000], np.uint32)
     rows, index = torch.from_numpy(bits.view(np.float32).reshape(4, 1)), torch.tensor([3, 0, 1, 2])
     given = gather_rows(rows, index).numpy().view(np.uint32).ravel().tolist()
@@ -51,7 +51,7 @@ def test_a_gather_keeps_every_bit() -> None:
 
 
 @pytest.mark.parametrize("number", [4, -1])
-def test_a_row_outside_the_table_is_refused(number: int) -> None:
+def test_row_out_of_range_is_rejected(number: int) -> None:
     with pytest.raises((IndexError, RuntimeError)):
         gather_rows(torch.zeros(4, 3), torch.tensor([0, number]))
 
@@ -65,6 +65,6 @@ def test_a_row_outside_the_table_is_refused(number: int) -> None:
         torch.arange(4, dtype=torch.float32),
     ],
 )
-def test_other_tables(rows: torch.Tensor) -> None:
+def test_gather_accepts_other_dtypes_and_strides(rows: torch.Tensor) -> None:
     index = torch.tensor([3, 3, 0])
     assert same(gather_rows(rows, index), rows, index)

@@ -23,7 +23,7 @@ STRATA, CONDITIONS, ACTIONS = (
     st.lists(st.integers(-5, 40) | st.integers(7 << 40, (7 << 40) + 9), max_size=60),
     st.integers(0, 1 << 50),
 )
-def test_one_place_of_each_value_however_far_apart_they_are(values: list[int], first: int) -> None:
+def test_first_places_cover_each_value_once(values: list[int], first: int) -> None:
     key = np.array(values, np.int64) + first
     places = first_places(key)
     assert key[places].tolist() == sorted(set(key.tolist()))
@@ -31,7 +31,7 @@ def test_one_place_of_each_value_however_far_apart_they_are(values: list[int], f
 
 @settings(max_examples=40)
 @given(arrays(np.float64, st.integers(1, 40), elements=st.floats(0, 2**40)))
-def test_every_age_is_in_the_bucket_of_its_power_of_two(age: np.ndarray) -> None:
+def test_ages_are_bucketed_by_powers_of_two(age: np.ndarray) -> None:
     columns = sampled_rows.ages("days", age)
     assert sum(columns["count"]) == len(age)
     counted = zip(columns["bucket"].tolist(), columns["count"].tolist(), strict=True)
@@ -77,7 +77,7 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
-def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool) -> None:
+def test_sums_by_stratum_and_condition(rows: int, seed: int, greedy: bool) -> None:
     of = source(rows, seed, greedy=greedy)
     strata = sampled_rows.strata(of, np.array([rows, 0, 0]))
     weight = of.rows["weight"].astype(np.float64)
@@ -104,7 +104,7 @@ def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99))
-def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> None:
+def test_episode_draws_by_stratum_and_condition(rows: int, seed: int) -> None:
     of = source(rows, seed, greedy=False)
     columns = sampled_rows.sampled_episodes(of)
     cells = zip(columns["episode"], columns["stratum"], columns["condition"], strict=True)
@@ -119,7 +119,7 @@ def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> N
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
-def test_every_action_has_a_row_even_if_never_drawn(rows: int, seed: int, greedy: bool) -> None:
+def test_undrawn_actions_have_rows(rows: int, seed: int, greedy: bool) -> None:
     of = source(rows, seed, greedy=greedy)
     columns = sampled_rows.actions(of, ACTIONS)
     cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))

@@ -26,7 +26,7 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
     return live
 
 
-def test_run_interrupted_before_evaluation_has_latest_policy(tmp_path):
+def test_run_interrupted_before_evaluation_keeps_latest(tmp_path):
     """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
     live = session(tmp_path / "a", config())
     interrupted(live, lambda: live.progress.env_steps >= 700)
@@ -45,7 +45,7 @@ def test_run_interrupted_before_evaluation_has_latest_policy(tmp_path):
 @pytest.mark.parametrize(
     ("phase", "chosen", "step"), [("offline", "latest", 0), ("warmup", "best", 0)]
 )
-def test_a_run_interrupted_before_it_learned_in_the_twin(phase, chosen, step, tmp_path):
+def test_interruption_before_online_learning(phase, chosen, step, tmp_path):
     """On the logs nothing is evaluated yet; in the warm-up, all that it learned is."""
     live = session(tmp_path / "a", config())
 
@@ -61,7 +61,7 @@ def test_a_run_interrupted_before_it_learned_in_the_twin(phase, chosen, step, tm
     assert now.gradient_steps == live.learner.gradient_steps
 
 
-def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
+def test_evaluation_after_last_checkpoint_counts(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config())
     interrupted(live, lambda: live.progress.env_steps >= 700)
     before = live.run.latest.read_bytes()
@@ -75,7 +75,7 @@ def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
     assert now.env_steps >= 800
 
 
-def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, shell):
+def test_reports_name_the_driven_policy(tmp_path, shell):
     path = tmp_path / "run"
     settings = [
         *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),
@@ -125,7 +125,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(tmp_path, shell)
     assert "step 60" not in said
 
 
-def test_run_stopped_before_its_first_update_has_no_policy(tmp_path: Path) -> None:
+def test_run_stopped_before_first_update_has_no_policy(tmp_path: Path) -> None:
     changes: dict[str, Any] = {"schedule": {"warmup_env_steps": 400}}
     live = session(tmp_path / "a", config(**changes), logs=None)
     interrupted(live, lambda: live.progress.env_steps >= 100)

@@ -47,7 +47,7 @@ def batch(rng: np.random.Generator, logged: int, fresh: int, weighted: bool) -> 
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.booleans()), max_size=8),
     st.integers(0, 8),
 )
-def test_compiled_code_keeps_what_numpy_does(seed, sizes, cleared_after):
+def test_compiled_rows_match_numpy(seed, sizes, cleared_after):
     rng = np.random.default_rng(seed)
     ring = ring_of(rng)
     both = [(SampledRows(LOGGED), SampledRows(FRESH)) for _ in range(2)]

@@ -19,7 +19,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedBuffer:
     return trained_sb3(tmp_path_factory.mktemp("library"))
 
 
-def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
+def test_dqn_trains_offline_then_on_half_logs(trained: TrainedBuffer) -> None:
     feed, tables, size = trained.feed, trained.tables, trained.batch_size
     assert feed.env_steps == trained.env_steps == 520
     assert feed.batches == trained.updates > 2 * trained.offline_updates
@@ -38,7 +38,7 @@ def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     assert all(row["td_abs_mean"] > 0 for row in tables["strata"] if row["drawn_rows"])
 
 
-def test_a_nonfinite_network_stops_and_names_the_rows(tmp_path):
+def test_nonfinite_loss_stops_and_names_rows(tmp_path):
     """Where the buffer is told of TD errors; what was recorded before stays whole."""
     trained = trained_sb3(tmp_path, 80)
     updates = trained.feed.batches
@@ -52,7 +52,7 @@ def test_a_nonfinite_network_stops_and_names_the_rows(tmp_path):
     assert sum(row["updates"] for row in trained.tables["progress"]) == updates
 
 
-def test_a_row_that_is_not_finite_stops_the_loop_and_is_named(trained: TrainedBuffer) -> None:
+def test_nonfinite_logged_row_stops_and_is_named(trained: TrainedBuffer) -> None:
     feed = trained.feed
     drawing = feed.draw_logs(4)
     packed = np.zeros((len(drawing.rows), 3), np.float32)
@@ -61,7 +61,7 @@ def test_a_row_that_is_not_finite_stops_the_loop_and_is_named(trained: TrainedBu
         feed.drawn(packed, drawing, np.empty(0, np.int64))
 
 
-def test_the_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
+def test_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
     drawn: dict[str, int] = {}
     for row in trained.tables["strata"]:
         if row["source"] == "logs":
@@ -72,7 +72,7 @@ def test_the_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
     assert drawn["wheel_slip"] == pytest.approx(0.25 * total, abs=2)
 
 
-def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> None:
+def test_audit_rows_identify_their_transitions(trained: TrainedBuffer) -> None:
     audit, panel = trained.tables["audit"], trained.panel
     assert {row["source"] for row in audit} == {"logs", "fresh"}
     assert all(np.isfinite(row["td"]) and np.isfinite(row["q"]) for row in audit)

@@ -45,7 +45,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return panel_of(store, mixture, folder / "panel").path
 
 
-def test_every_example_is_run_and_explained() -> None:
+def test_every_example_is_tested_and_documented() -> None:
     own = {"qr_dqn"}  # tests/train/test_own_algorithm.py trains it
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {*NEEDS, *own}
     page = (EXAMPLES.parent / "libraries.md").read_text(encoding="utf-8")
@@ -61,7 +61,7 @@ def test_stable_baselines3_dqn() -> None:
 
 
 @pytest.mark.long
-def test_stable_baselines3_sac_on_the_continuous_face() -> None:
+def test_stable_baselines3_sac_on_continuous_actions() -> None:
     done = example("sb3_sac").main(steps=200, num_envs=4)
     assert done["env_steps"] == 200
     assert done["updates"] == (200 - 48) / 4  # from step 48 on
@@ -79,21 +79,21 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
     assert (tmp_path / "run" / "strata.parquet").is_file()
 
 
-def test_a_task_of_ones_own_learns_what_is_rare() -> None:
+def test_custom_task_learns_rare_condition() -> None:
     done = example("any_task").main(updates=200, episodes=200)
     assert done["success"] == {"nominal": True, "rare": True}
     assert done["rows fed"] == {"nominal": 200 * 64, "rare": 200 * 64}
 
 
 @pytest.mark.long  # its import alone takes seconds
-def test_tianshous_collectors_and_dqn() -> None:
+def test_tianshou_dqn() -> None:
     done = example("tianshou_dqn").main(steps=96, num_envs=8)
     assert done["env_steps"] == 96
     assert done["updates"] == 96 / 4
 
 
 @pytest.mark.long
-def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
+def test_cleanrl_dqn_on_vector_environment() -> None:
     done = example("cleanrl_dqn").main(steps=2400, num_envs=8)
     assert done["env_steps"] == 2400
     assert done["updates"] == (2400 - 600) / 4
@@ -102,7 +102,7 @@ def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
 
 
 @pytest.mark.long
-def test_a_single_file_dqn_on_logs_and_fresh_rows(panel: Path) -> None:
+def test_cleanrl_dqn_on_logs_and_fresh_rows(panel: Path) -> None:
     done = example("cleanrl_dqn").main(steps=96, num_envs=8, panel=str(panel), offline_updates=20)
     assert done["updates"] == 20 + (96 - 24) / 4  # 24 steps are collected first
     assert done["loss"] >= 0

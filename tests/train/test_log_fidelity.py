@@ -30,14 +30,14 @@ def levels(seed: int) -> list[NDArray[np.float32]]:
     return [rows(rng, level) for level in (0.0, 2.0, -2.0)]
 
 
-def test_good_rows_look_like_their_condition_and_follow() -> None:
+def test_sound_rows_agree_and_are_explained() -> None:
     logs = LogFidelity(probe(levels(0)), SIZE)
     assert all(share > 0.9 for share in logs.agreement(probe(levels(1))).values())
     assert all(rest < 0.2 for rest in logs.unexplained.values())
     assert set(logs.unexplained) == set(CONDITIONS)
 
 
-def test_steps_of_several_sources_confirm_together() -> None:
+def test_agreement_combines_sources() -> None:
     """An evaluation that shows few of a condition, and a ring that has it."""
     logs = LogFidelity(probe(levels(0)), SIZE)
     nominal, slip, blocked = levels(1)
@@ -48,7 +48,7 @@ def test_steps_of_several_sources_confirm_together() -> None:
     assert all(share > 0.9 for share in found.values())
 
 
-def test_wrong_labels_are_not_confirmed() -> None:
+def test_wrong_labels_have_low_agreement() -> None:
     nominal, slip, blocked = levels(0)
     logs = LogFidelity(probe([np.concatenate([nominal[:100], blocked]), slip, nominal[100:]]), SIZE)
     found = logs.agreement(probe(levels(1)))
@@ -56,7 +56,7 @@ def test_wrong_labels_are_not_confirmed() -> None:
     assert found["wheel_slip"] > 0.9
 
 
-def test_next_observations_of_other_rows_do_not_follow() -> None:
+def test_shuffled_next_observations_are_unexplained() -> None:
     nominal, slip, blocked = levels(0)
     blocked[:, SIZE : 2 * SIZE] = np.random.default_rng(2).permutation(blocked[:, SIZE : 2 * SIZE])
     found = LogFidelity(probe([nominal, slip, blocked]), SIZE).unexplained
@@ -64,7 +64,7 @@ def test_next_observations_of_other_rows_do_not_follow() -> None:
     assert found["blocked_aisle"] > 3 * max(found["nominal"], found["wheel_slip"])
 
 
-def test_conditions_of_few_rows_are_not_judged() -> None:
+def test_conditions_with_few_rows_are_skipped() -> None:
     nominal, slip, blocked = levels(0)
     logs = LogFidelity(probe([nominal, slip, blocked[:5]]), SIZE)
     assert set(logs.unexplained) == {"nominal", "wheel_slip"}

@@ -31,9 +31,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_nothing_drives_and_what_was_learnt_last_is_kept(
-    panel, tmp_path, monkeypatch, quick_models, shell
-):
+def test_training_without_twin_keeps_last_policy(panel, tmp_path, monkeypatch, quick_models, shell):
     def refuse(*given: object, **named: object) -> None:
         raise AssertionError("a twin was made")
 
@@ -59,7 +57,7 @@ def test_nothing_drives_and_what_was_learnt_last_is_kept(
     assert main(["report", str(out), "--card"]) == 0
 
 
-def test_without_logs_there_is_nothing_to_learn_from(panel, tmp_path, shell):
+def test_training_without_twin_needs_logs(panel, tmp_path, shell):
     argv = ["train", "--out", str(tmp_path / "run")]
     assert "there is no panel" in shell.err(*argv, *flags("env.twin=false"))
     requested = flags("env.twin=false", "teacher.source=operator")

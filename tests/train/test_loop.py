@@ -37,7 +37,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 @pytest.mark.long
-def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
+def test_corridor_is_solved_without_logs(tmp_path: Path) -> None:
     live = run_to_end(tmp_path / "a", config(schedule={"env_steps": 6000}), logs=None)
     assert live.best is not None
     assert live.best.success == {"nominal": 1.0, "wheel_slip": 1.0}
@@ -49,7 +49,7 @@ def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_logs", [True, False])
-def test_run_out_of_time_still_makes_an_interval_of_updates(tmp_path, with_logs):
+def test_spent_budget_still_makes_one_interval_of_updates(tmp_path, with_logs):
     """There is a policy to keep and something to report, however slow the machine."""
     settings = config(schedule={"seconds": 1e-9, "offline_updates": 1000, "env_steps": 6000})
     live = run_to_end(tmp_path / "a", settings, **({} if with_logs else {"logs": None}))
@@ -61,7 +61,7 @@ def test_run_out_of_time_still_makes_an_interval_of_updates(tmp_path, with_logs)
     assert (live.progress.env_steps == 0) == with_logs
 
 
-def test_run_drives_for_half_of_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_of_seconds_budget_is_online(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a robot of few logs and a slow twin ends with a policy that never drove in it."""
     seconds = count(step=0.01)  # by a clock that each look moves on
     monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
@@ -86,12 +86,12 @@ class AtOnce(Executor):
         return future
 
 
-def test_simulating_on_another_thread_changes_nothing(undisturbed, tmp_path, monkeypatch):
+def test_simulation_thread_does_not_change_results(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr("restock.train.session.ThreadPoolExecutor", lambda *_: AtOnce())
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config()))
 
 
-def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
+def test_resume_on_other_logged_rows_is_rejected(tmp_path: Path) -> None:
     settings = config(schedule={"env_steps": 400})
     first = run_to_end(tmp_path / "run", settings)
     probe = pq.read_table(first.run.path / "probe.parquet")["probe_hash"].unique().to_pylist()
@@ -102,7 +102,7 @@ def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_run_without_its_kept_policy_is_refused(undisturbed, tmp_path, damage):
+def test_run_without_best_checkpoint_is_rejected(undisturbed, tmp_path, damage):
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
     best = path / "checkpoints" / "best.safetensors"
     content = best.read_bytes()
@@ -119,7 +119,7 @@ def test_run_without_its_kept_policy_is_refused(undisturbed, tmp_path, damage):
     assert pq.read_table(path / "progress.parquet").equals(undisturbed.run.table("progress"))
 
 
-def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:
+def test_half_of_online_batch_is_logged_by_quota(undisturbed: Session) -> None:
     strata = pq.read_table(undisturbed.run.path / "strata.parquet").to_pylist()
     offline = [row for row in strata if row["phase"] == "offline"]
     assert {row["source"] for row in offline} == {"logs"}
@@ -164,7 +164,7 @@ def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
     assert sum(pq.read_table(path / "progress.parquet")["updates"].to_pylist()) == steps
 
 
-def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session) -> None:
+def test_critic_is_measured_on_evaluation_steps(undisturbed: Session) -> None:
     path = undisturbed.run.path
     evaluated = set(pq.read_table(path / "evaluations.parquet")["gradient_steps"].to_pylist())
     measured = pq.read_table(path / "evaluation_buffer.parquet").to_pylist()
@@ -173,7 +173,7 @@ def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session
     assert all(row["rows"] > 0 and row["td_abs_mean"] > 0 for row in measured)
 
 
-def test_evaluation_does_not_depend_on_what_drove_before(tmp_path: Path) -> None:
+def test_evaluation_is_repeatable(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config())
     policy = GreedyPolicy(live.learner.policy_network)
     specs = fixed_episodes(["nominal", "wheel_slip"], 4, 7)  # 8 episodes in 3 corridors
@@ -190,7 +190,7 @@ def test_evaluation_does_not_depend_on_what_drove_before(tmp_path: Path) -> None
     live.close()
 
 
-def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:
+def test_audit_rows_match_drawn_rows(undisturbed: Session) -> None:
     audit = pq.read_table(undisturbed.run.path / "audit.parquet").to_pylist()
     batches = {row["gradient_step"] for row in audit}
     assert len(audit) == 32 * len(batches)
@@ -231,7 +231,7 @@ def test_finished_episodes_are_labelled_in_the_ring(undisturbed: Session) -> Non
     assert set(slip_rows[:, -3].tolist()) == {1.0}
 
 
-def test_the_run_says_its_target_rule_and_lag(undisturbed: Session, tmp_path: Path) -> None:
+def test_run_records_target_rule_and_lag(undisturbed: Session, tmp_path: Path) -> None:
     progress = pq.read_table(undisturbed.run.path / "progress.parquet").to_pylist()
     learning = [row for row in progress if row["updates"]]
     assert {row["target_rule"] for row in learning} == {"polyak tau 0.05"}
@@ -250,7 +250,7 @@ def test_the_run_says_its_target_rule_and_lag(undisturbed: Session, tmp_path: Pa
     assert {row["steps_since_sync"] for row in full} == {0}
 
 
-def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session) -> None:
+def test_best_checkpoint_has_best_evaluation(undisturbed: Session) -> None:
     best = checkpoint.load(undisturbed.run.best)
     rows = pq.read_table(undisturbed.run.path / "evaluations.parquet").to_pylist()
     marked = {row["env_steps"] for row in rows if row["best"]}
@@ -275,7 +275,7 @@ def test_warmup_collects_without_learning(tmp_path):
     assert "schedule.warmup_env_steps=400" in said
 
 
-def test_resumed_run_says_that_its_budget_is_used_up(undisturbed: Session, tmp_path: Path) -> None:
+def test_resume_reports_spent_budget(undisturbed: Session, tmp_path: Path) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
 
     def said(**schedule: Any) -> str:
@@ -294,7 +294,7 @@ def test_resumed_run_says_that_its_budget_is_used_up(undisturbed: Session, tmp_p
     undisturbed.progress.evaluated_at = before
 
 
-def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path) -> None:
+def test_finished_run_is_unchanged_by_resume(tmp_path: Path) -> None:
     settings = config(schedule={"env_steps": 1200}, record={"trackers": ["tensorboard"]})
     done = session(tmp_path / "run", settings)
     outcome = train(done)
@@ -313,7 +313,7 @@ def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path)
     assert files() == before
 
 
-def test_the_policy_that_is_kept_is_an_average_of_the_weights(monkeypatch):
+def test_kept_policy_averages_weights(monkeypatch):
     rows = logs().rows[:32].clone()
     for rate in (1.0, 0.25):
         monkeypatch.setattr("restock.train.dqn.network.AVERAGING", rate)
@@ -331,7 +331,7 @@ def test_the_policy_that_is_kept_is_an_average_of_the_weights(monkeypatch):
         assert torch.allclose(learner.policy_network.advantage.bias, expected, atol=1e-6)
 
 
-def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) -> None:
+def test_conservative_loss_lowers_unlogged_actions(tmp_path: Path) -> None:
     """Offline on rows that only drive forward: without it, "back" is worth what chance says."""
     shelf = logs(400)
     forward = np.flatnonzero(shelf.rows[:, -3].numpy() == 1)
@@ -356,7 +356,7 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
-def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
+def test_margin_drivers_are_listed_once(tmp_path: Path) -> None:
     shelf = logs()
     nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile
     shelf = dataclasses.replace(shelf, behaviour_policy=nobody)
@@ -365,13 +365,13 @@ def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
         LogTerms.of(margin, shelf, torch.device("cpu"))
 
 
-def test_condition_that_cannot_run_is_refused_first(tmp_path: Path) -> None:
+def test_invalid_condition_is_rejected_before_training(tmp_path: Path) -> None:
     broken = Condition("wet", "pre", "humidity > 3")
     with pytest.raises(ConfigError, match="condition 'wet'"):
         session(tmp_path / "a", config(), conditions=[broken])
 
 
-def test_a_bump_that_ends_an_evaluations_episode_is_counted(tmp_path: Path) -> None:
+def test_terminating_bump_is_counted(tmp_path: Path) -> None:
     class Backwards:
         """Into the wall behind the first cell."""
 

@@ -17,7 +17,7 @@ def test_td_target_by_hand() -> None:
     assert target.tolist() == pytest.approx([4.6, 1.0])
 
 
-def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
+def test_double_dqn_evaluates_with_target_network() -> None:
     online = tensor([[9.0, 1.0]])  # prefers action 0
     slow = tensor([[2.0, 4.0]])  # values it 2, though its own best is worth 4
     reward, discount = tensor([1.0]), tensor([0.5])
@@ -27,7 +27,7 @@ def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
     assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
 
 
-def test_a_preference_selects_and_is_no_part_of_the_value() -> None:
+def test_preference_selects_but_adds_no_value() -> None:
     reward, discount = tensor([1.0]), tensor([0.5])
     slow, online = tensor([[4.0, 2.0, 8.0]]), tensor([[1.0, 3.0, 5.0]])
     implausible, proposed = tensor([[0, 0, -torch.inf]]), tensor([[9.0, 0, 0]])

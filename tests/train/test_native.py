@@ -42,7 +42,7 @@ def made_native(held: QNetwork, *, wide: bool = True) -> Kernel:
 @pytest.mark.parametrize("hidden", SHAPES)
 @pytest.mark.parametrize("layer_norm", [False, True])
 @pytest.mark.parametrize("batch", [1, 37])
-def test_values_and_gradients_are_autograds(hidden, layer_norm, batch):
+def test_values_and_gradients_match_autograd(hidden, layer_norm, batch):
     """Of the same network in double precision; and the same bits, how wide vectors ever are."""
     held = network(hidden, layer_norm)
     exact = clone(held).double().requires_grad_()
@@ -77,7 +77,7 @@ def test_values_and_gradients_are_autograds(hidden, layer_norm, batch):
 
 
 @compiled
-def test_a_network_that_does_not_learn_is_evaluated_alone() -> None:
+def test_frozen_network_is_evaluated_without_gradients() -> None:
     still = clone(network((16, 16), layer_norm=True))
     backprop = Kernel(still, FlatParameters(still, learns=False).values)
     q = backprop(normal(3, OBSERVATION, seed=0))
@@ -90,7 +90,7 @@ def floats(*shape: int) -> np.ndarray:
 
 
 @compiled
-def test_what_does_not_fit_is_refused() -> None:
+def test_arrays_of_wrong_shape_or_dtype_are_rejected() -> None:
     """Sizes, types, strides: an error, never a read or a write beside the array."""
     module = native.compiled
     size = 7 * 16 + 16 + 4 * 16 + 16  # of (7, 16, 4), without LayerNorm
@@ -130,7 +130,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 @compiled
-def test_the_compiled_way_is_that_of_one_thread() -> None:
+def test_compiled_path_needs_cpu_and_one_thread() -> None:
     assert update_path("cpu") == "native"
     assert update_path("cpu", threads=2) == "autograd"
     assert update_path("cuda") == "autograd"
@@ -141,7 +141,7 @@ def test_the_compiled_way_is_that_of_one_thread() -> None:
     ("value", "used"),
     [("0", False), ("no", False), ("False", False), ("OFF", False), ("1", True), ("", True)],
 )
-def test_the_usual_words_switch_it_off(value, used, monkeypatch):
+def test_environment_variable_disables_native_code(value, used, monkeypatch):
     monkeypatch.setenv(native.SWITCH, value)
     probe = "from restock import native; print(native.IS_USED, native.state().startswith('in use'))"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
@@ -149,7 +149,7 @@ def test_the_usual_words_switch_it_off(value, used, monkeypatch):
 
 
 @pytest.mark.parametrize("way", ["asked for", "not compiled"])
-def test_without_it_pytorch_does_the_work(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pytorch_is_used_without_native_code(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     absent = "sys.modules['restock._native'] = None" if way == "not compiled" else ""
     monkeypatch.setenv(native.SWITCH, "0" if way == "asked for" else "1")
     probe = f"""
@@ -172,7 +172,7 @@ main(["--version"])
 
 
 @compiled
-def test_passes_that_another_one_followed_are_differentiated() -> None:
+def test_gradients_of_two_forward_passes_add_up() -> None:
     """As autograd does: gradients of two passes are added, in any order."""
     held = network((16, 16), layer_norm=True)
     theirs = clone(held).requires_grad_()
@@ -187,7 +187,7 @@ def test_passes_that_another_one_followed_are_differentiated() -> None:
 @compiled
 @pytest.mark.parametrize("source", ["operator", "none"])
 @pytest.mark.parametrize("double", [True, False])
-def test_an_update_without_autograd_has_its_bits(source, double, monkeypatch):
+def test_native_update_is_bit_identical_to_autograd(source, double, monkeypatch):
     settings = {"teacher": {"source": source}, "loss": {"double": double, "huber_delta": 0.5}}
     ours, theirs = (Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2))
     theirs._has_kernels = False

@@ -18,7 +18,7 @@ def test_layer_norm_makes_features_independent_of_scale(layer_norm: bool) -> Non
     assert torch.allclose(network(observation), before, atol=1e-3) == layer_norm
 
 
-def test_a_clone_takes_no_gradients() -> None:
+def test_cloned_network_has_no_gradients() -> None:
     network = QNetwork(5, 3, hidden=(8,))
     assert all(parameter.requires_grad for parameter in network.parameters())
     assert not any(parameter.requires_grad for parameter in clone(network).parameters())

@@ -38,7 +38,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, shell):
+def test_changed_panel_byte_is_rejected_before_training(panel, tmp_path, shell):
     out = tmp_path / "run"
     rows = panel / "rows.f32"
     whole = rows.read_bytes()
@@ -66,7 +66,7 @@ def test_changed_byte_of_the_panel_is_refused_first(panel, tmp_path, shell):
         rows.write_bytes(whole)
 
 
-def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(panel, tmp_path, shell):
+def test_nonfinite_loss_exits_with_code_2(panel, tmp_path, shell):
     out = tmp_path / "run"
     argv = ["train", "--panel", str(panel), "--out", str(out), *TINY]
     said = shell.err(*argv, "--set", "optimizer.learning_rate=1e30")
@@ -81,7 +81,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(panel, tmp_path
     assert not (out / "checkpoints").exists()  # nothing of it was kept
 
 
-def test_a_row_that_is_not_finite_is_named(tmp_path: Path) -> None:
+def test_nonfinite_logged_row_is_named(tmp_path: Path) -> None:
     given = logs()
     rows = given.rows.clone()
     rows[77, 2] = float("nan")
@@ -94,7 +94,7 @@ def test_a_row_that_is_not_finite_is_named(tmp_path: Path) -> None:
     assert stopped["gradient_steps"] == live.learner.gradient_steps
 
 
-def test_a_fresh_row_is_named_by_its_episode_and_step(tmp_path: Path) -> None:
+def test_nonfinite_fresh_row_names_episode_and_step(tmp_path: Path) -> None:
     live = session(tmp_path / "run", config(), logs=None)
     ring = live.ring
 
@@ -110,7 +110,7 @@ def test_a_fresh_row_is_named_by_its_episode_and_step(tmp_path: Path) -> None:
     assert named == {(int(ring.meta["episode"][5]), int(ring.meta["episode_step"][5]))}
 
 
-def test_nonfinite_network_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
+def test_nonfinite_network_is_not_saved(tmp_path: Path) -> None:
     settings = config(schedule={"env_steps": 800})
     live = session(tmp_path / "run", settings)
     seen: list[str] = []

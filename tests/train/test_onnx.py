@@ -36,7 +36,7 @@ TASK = load_profile("warehouse_amr").task
     ],
     ids=str,
 )
-def test_values_and_actions_are_those_of_torch(settings: dict[str, Any]) -> None:
+def test_onnx_values_and_actions_match_torch(settings: dict[str, Any]) -> None:
     network = {"hidden": [32, 24], **settings.get("network", {})}
     policy = make_learner(parse_config({**settings, "network": network}, where="test"), TASK).policy
     session = runtime.InferenceSession(to_onnx(policy).SerializeToString())
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return kept_run(tmp_path_factory.mktemp("runs") / "a")
 
 
-def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, shell: Shell) -> None:
+def test_onnx_file_describes_its_inputs(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
     said = shell.json("export", run, "--to", "onnx", "--out", out)
     assert onnx.load(out).ir_version == 8  # the first with opset 18; ONNX Runtime 1.16 reads 9
@@ -72,7 +72,7 @@ def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, shell: Shell) ->
     assert meta["version"] == "a@7"
 
 
-def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, shell: Shell) -> None:
+def test_eval_of_onnx_policy_matches_agent(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
     assert main(["export", str(run), "--to", "onnx", "--out", str(out)]) == 0
     policies = f"agent,onnx:{out},run:{run}"
@@ -90,7 +90,7 @@ def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, shell: S
     assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
 
 
-def test_policy_is_written_into_no_store_or_other_run(run, tmp_path, shell):
+def test_export_into_store_or_other_run_is_rejected(run, tmp_path, shell):
     store = write_store(tmp_path / "store", [recording_transitions(1)])
     other = kept_run(tmp_path / "other")
     for place, said in ((store, "the store"), (other, "the run")):
@@ -102,7 +102,7 @@ def test_policy_is_written_into_no_store_or_other_run(run, tmp_path, shell):
     assert main(["export", str(other), "--to", "onnx", "--out", str(other / "p.onnx")]) == 0
 
 
-def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, shell: Shell) -> None:
+def test_invalid_onnx_policy_is_rejected(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
     argv = ["export", str(run), "--to", "onnx", "--out", str(out)]
     assert main(argv) == 0
@@ -125,7 +125,7 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, sh
     assert not (run / "eval").exists() or not list((run / "eval").glob("*.tmp"))
 
 
-def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, shell: Shell) -> None:
+def test_eval_reads_perturbation_file(run: Path, tmp_path: Path, shell: Shell) -> None:
     wet = tmp_path / "wet.toml"
     wet.write_text('name = "wet"\nfriction_scale = 0.5\n')
     argv = ["eval", str(run), "--dry-run", "--json", "--perturbations"]

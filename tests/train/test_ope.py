@@ -42,7 +42,7 @@ def panel(store: Path) -> Panel:
     return panel_of(store, MIXTURE, store.parent / "panel")
 
 
-def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel) -> None:
+def test_training_and_evaluation_episodes_are_disjoint(store: Path, panel: Panel) -> None:
     fed = set(panel.meta["episode_id"].to_pylist())
     held = set(pq.read_table(panel.path / "evaluation_split.parquet")["episode_id"].to_pylist())
     for logs in (None, str(panel.path), str(store)):
@@ -55,7 +55,7 @@ def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel
     assert "left out" in dataset.notes[0]
 
 
-def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:
+def test_logs_without_held_out_episodes_are_rejected(store: Path, tmp_path: Path) -> None:
     everything = parse_mixture(
         "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     )
@@ -69,7 +69,7 @@ def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> Non
         load_ope_dataset(None, TASK)
 
 
-def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
+def test_success_is_arrival_before_contact(tmp_path: Path) -> None:
     table = recording_transitions(1)
     stops = table["terminated"].to_numpy() & (table["episode_index"].to_numpy() % 3 == 0)
     table = replaced(table, {"reward": np.where(stops, -6.0, table["reward"].to_numpy())})
@@ -101,7 +101,7 @@ def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
     assert measured.rows.terminated.sum() == sum(ends)
 
 
-def test_held_out_end_is_measured_from_its_own_start(tmp_path: Path) -> None:
+def test_contact_before_held_out_part_is_ignored(tmp_path: Path) -> None:
     """A contact before it left none of its rows, and the evaluation ended in an IndexError."""
     with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as opened:
         found = opened.sql(
@@ -117,7 +117,7 @@ def test_held_out_end_is_measured_from_its_own_start(tmp_path: Path) -> None:
     assert not steps.bumped_before[first].any()
 
 
-def test_weights_use_logged_or_else_cloned_probabilities(panel):
+def test_weights_fall_back_to_cloned_probabilities(panel):
     dataset = load_ope_dataset(panel, TASK)
     network = kept_network(NETWORK)
     rows = evaluate_off_policy(network, dataset, discount=0.97, config=CONFIG)
@@ -146,7 +146,7 @@ def _known(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
-def test_the_verb_evaluates_and_says_why_it_refuses(
+def test_eval_on_logs_reports_values_and_refusals(
     store, panel, tmp_path, quick_models, capsys, shell
 ):
     run = kept_run(tmp_path / "a", NETWORK, panel)
@@ -176,7 +176,7 @@ def test_the_verb_evaluates_and_says_why_it_refuses(
     assert main(["eval", str(run), "--on-logs", str(tmp_path / "nowhere")]) == 2
 
 
-def test_training_evaluates_off_policy_before_it_drives(panel, tmp_path, quick_models, capsys):
+def test_training_runs_off_policy_evaluation_first(panel, tmp_path, quick_models, capsys):
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
     small = ["schedule.offline_updates=3", "network.hidden=[8]", "evaluation.episodes=1"]

@@ -85,7 +85,7 @@ def repeated(episodes: int) -> np.ndarray:
     )
 
 
-def test_normalised_weights_are_consistent() -> None:
+def test_weighted_estimate_is_consistent() -> None:
     """More episodes, less error; and little of it with many."""
     few, many = (np.sqrt(np.mean((repeated(n) - TRUTH) ** 2)) for n in (10, 250))
     assert many < few / 2
@@ -93,14 +93,14 @@ def test_normalised_weights_are_consistent() -> None:
     assert found == pytest.approx(TRUTH, abs=0.02)
 
 
-def test_fitted_q_evaluation_is_as_wrong_as_its_model() -> None:
+def test_fqe_has_the_bias_of_its_model() -> None:
     wrong = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, CHAIN.q(TARGET) + 0.5)
     answers = {e.estimator: e for e in _estimates(logged(4000, 2, wrong))}
     assert answers["fqe"].value == pytest.approx(TRUTH + 0.5, abs=1e-6)
     assert (answers["fqe"].low, answers["fqe"].high) == (None, None)  # it would leave that .5 out
 
 
-def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
+def test_intervals_have_nominal_coverage() -> None:
     inside = 0
     for seed in range(100):
         for answer in _estimates(logged(120, seed, NO_MODEL), resamples=300):
@@ -111,7 +111,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     assert inside >= 85
 
 
-def test_weights_of_the_same_policy_are_all_one() -> None:
+def test_weights_of_equal_policies_are_one() -> None:
     same = logged(40, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
     np.testing.assert_allclose(effective_episodes(same.ratio), 40.0)
     plain = observed(same, once(40))
@@ -119,7 +119,7 @@ def test_weights_of_the_same_policy_are_all_one() -> None:
     assert EssGate().refusal(same) is None
 
 
-def test_gate_refuses_a_policy_far_from_the_logs() -> None:
+def test_gate_refuses_policy_far_from_logs() -> None:
     far = np.tile([0.97, 0.03], (STATES, 1))
     away = logged(60, 4, CHAIN.q(far), far)
     answers = {e.estimator: e for e in _estimates(away)}
@@ -130,7 +130,7 @@ def test_gate_refuses_a_policy_far_from_the_logs() -> None:
     assert 0 < reach < STEPS
 
 
-def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
+def test_too_few_episodes_give_their_own_reason() -> None:
     """A single episode is worth one, whatever the policy: that says nothing of agreement."""
     alone = logged(1, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
     answers = {e.estimator: e.refused for e in _estimates(alone)}
@@ -160,7 +160,7 @@ def rows(episodes: int, seed: int) -> tuple[Transitions, np.ndarray]:
     ), following
 
 
-def test_fitted_q_finds_the_exact_values() -> None:
+def test_fitted_q_matches_exact_values() -> None:
     seen, following = rows(600, 8)
     policy = TARGET.astype(np.float32)
     network = fitted_q(seen, policy[following], discount=DISCOUNT, config=TABULAR)
@@ -168,7 +168,7 @@ def test_fitted_q_finds_the_exact_values() -> None:
     np.testing.assert_allclose(found[:-1], CHAIN.q(TARGET)[:-1], atol=0.06)
 
 
-def test_a_fitted_value_is_the_mean_of_rare_and_large_rewards() -> None:
+def test_fitted_value_is_mean_of_rare_large_rewards() -> None:
     """One step in ten costs 10, the others pay 1: Huber's loss said that it pays .9 on average."""
     rows, reward = 1000, np.ones(1000, np.float32)
     reward[::10] = -10.0
@@ -184,7 +184,7 @@ def test_a_fitted_value_is_the_mean_of_rare_and_large_rewards() -> None:
     assert values(network, seen.observation[:1])[0, 0] == pytest.approx(-0.1, abs=0.25)
 
 
-def test_cloning_finds_the_behaviour() -> None:
+def test_cloning_recovers_behaviour_policy() -> None:
     seen, _ = rows(600, 10)
     network = cloned_behaviour(
         seen.observation, seen.action, ACTIONS, config=replace(TABULAR, cloning_updates=400)

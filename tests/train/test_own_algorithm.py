@@ -14,7 +14,7 @@ from restock.train.dqn.learner import Learner
 EXAMPLE = ROOT / "docs/examples/qr_dqn.py"
 
 
-def test_qr_dqn_in_one_file_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_qr_dqn_example_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLE.parent))
     assert len(EXAMPLE.read_text().splitlines()) <= 150
     one = run_to_end(tmp_path / "run", config(loss={"algorithm": "qr_dqn:QRDQN"}))
@@ -27,6 +27,6 @@ def test_qr_dqn_in_one_file_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", ["c52", "no_such_module:X", "math:Missing"])
-def test_an_unknown_algorithm_is_refused(name: str) -> None:
+def test_unknown_algorithm_is_rejected(name: str) -> None:
     with pytest.raises(ConfigError, match=r"loss\.algorithm"):
         Learner(config(loss={"algorithm": name}), TASK.observation_size, 3)

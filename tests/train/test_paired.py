@@ -74,7 +74,7 @@ def compared(first: Path, second: Path) -> list[dict[str, Any]]:
     return paired(*map(by_cell, tables))
 
 
-def test_a_policy_is_worse_better_or_left_open(baseline: Path, tmp_path: Path) -> None:
+def test_paired_verdicts_per_condition(baseline: Path, tmp_path: Path) -> None:
     other = evaluated(
         tmp_path / "b", {"nominal": 1.0, "wheel_slip": 0.2, "blocked_aisle": 0.9}, shuffle=3
     )
@@ -91,14 +91,14 @@ def test_a_policy_is_worse_better_or_left_open(baseline: Path, tmp_path: Path) -
     assert slip["difference_low"] < -0.4 < slip["difference_high"] < 0
 
 
-def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
+def test_pairing_detects_small_drop(tmp_path: Path) -> None:
     """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
     first = evaluated(tmp_path / "a", GOOD)
     second = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
     assert verdicts(compared(first, second))["wheel_slip"] == "worse"
 
 
-def test_few_episodes_say_nothing_of_better_or_worse(tmp_path: Path) -> None:
+def test_few_episodes_are_inconclusive(tmp_path: Path) -> None:
     """One episode that fell is no regression: values, without interval and verdict."""
     good = evaluated(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
     bad = evaluated(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
@@ -118,7 +118,7 @@ def test_few_episodes_say_nothing_of_better_or_worse(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_only_episodes_of_both_are_compared(baseline, tmp_path, changes, episodes) -> None:
+def test_only_common_episodes_are_compared(baseline, tmp_path, changes, episodes) -> None:
     rows = compared(baseline, evaluated(tmp_path / "b", GOOD, **changes))
     nominal = [row for row in rows if row["condition"] == "nominal"]
     assert {row["perturbation"]: row["episodes"] for row in nominal} == episodes

@@ -42,7 +42,7 @@ def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_reads_the_action_nearest_to_the_proposal(seed: int) -> None:
+def test_proposal_reader_returns_nearest_action(seed: int) -> None:
     rng = np.random.default_rng(seed)
     command, known = rng.uniform(-1.2, 1.2, (50, 2)), rng.random(50) < 0.7
     near, offset, says = proposal_reader(TASK)
@@ -67,7 +67,7 @@ def values(one: Learner, q: list[float]) -> None:
             network.advantage.bias.copy_(tensor(q))
 
 
-def test_deviates_only_where_q_is_better_by_the_margin() -> None:
+def test_policy_deviates_only_beyond_the_margin() -> None:
     one = learner(0.3)
     command = np.asarray(TASK.actions)  # each action is proposed once
     observation = observed(command, np.ones(len(command), np.bool_))
@@ -81,7 +81,7 @@ def test_deviates_only_where_q_is_better_by_the_margin() -> None:
 
 
 @pytest.mark.parametrize("path", ["native", "autograd"])
-def test_target_is_the_value_of_what_the_policy_would_do(path: str) -> None:
+def test_td_target_uses_action_of_filtered_policy(path: str) -> None:
     one = learner(0.3, path=path)
     values(one, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
     after = observed(np.array([[0.0, 0.0], TASK.actions[2]]), np.ones(2, np.bool_))
@@ -92,7 +92,7 @@ def test_target_is_the_value_of_what_the_policy_would_do(path: str) -> None:
     assert td.tolist() == pytest.approx([1.0 - 0.5 * 1.0, 1.0 - 0.5 * 1.2])
 
 
-def test_with_constant_values_it_drives_as_the_planner_does() -> None:
+def test_constant_q_follows_the_planner() -> None:
     one = learner(0.3)
     values(one, [0.0] * len(TASK.actions))
     env = WarehouseVectorEnv(8, seed=3)
@@ -121,7 +121,7 @@ def kept(path, seed, **teacher):
     return load_agent(run)
 
 
-def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, shell: Shell) -> None:
+def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None:
     one, other = (
         kept(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
         for seed, name in enumerate("ab")
@@ -140,7 +140,7 @@ def test_the_mean_of_runs_is_a_run_with_a_smaller_margin(tmp_path: Path, shell: 
     assert main(words) == 2  # it exists
 
 
-def test_a_mean_of_means_filters_by_the_mean_of_the_logits(tmp_path: Path) -> None:
+def test_mean_of_means_averages_logits(tmp_path: Path) -> None:
     places = [tmp_path / name for name in "abcd"]
     filters = {"source": "operator", "ratio": 0.9}
     alone = [kept(place, seed, **filters).network for seed, place in enumerate(places)]
@@ -161,7 +161,9 @@ def test_a_mean_of_means_filters_by_the_mean_of_the_logits(tmp_path: Path) -> No
     ("teacher", "why"),
     [("none", "is not of the same task, network, algorithm and teacher"), (None, "holds 1 run")],
 )
-def test_runs_without_a_mean_are_refused(tmp_path: Path, teacher, why: str, shell: Shell) -> None:
+def test_runs_that_cannot_be_averaged_are_rejected(
+    tmp_path: Path, teacher, why: str, shell: Shell
+) -> None:
     kept(tmp_path / "runs" / "a", 0, source="planner")
     if teacher:
         kept(tmp_path / "runs" / "b", 1, source=teacher)
@@ -170,7 +172,7 @@ def test_runs_without_a_mean_are_refused(tmp_path: Path, teacher, why: str, shel
     assert not (tmp_path / "mean").exists()
 
 
-def test_a_robot_whose_proposals_are_not_read_is_refused(tmp_path: Path) -> None:
+def test_planner_teacher_needs_navigation_input(tmp_path: Path) -> None:
     text = (ROOT / "ingest/profile/profiles/warehouse_amr.toml").read_text("utf-8")
     begin = text.index("[inputs.nav_command]")
     end = text.index("\n[", begin)

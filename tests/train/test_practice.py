@@ -61,12 +61,12 @@ def test_shares_sum_to_one_and_keep_their_floor(data: st.DataObject) -> None:
         )
 
 
-def test_fixed_rules_give_what_they_say() -> None:
+def test_natural_and_even_rules_give_fixed_shares() -> None:
     assert practice(rule="natural").shares.tolist() == [0.6, 0.2, 0.15, 0.05]
     assert practice(rule="even").shares.tolist() == [0.25] * 4
 
 
-def test_success_practises_what_fails_once_it_is_believed(monkeypatch):
+def test_success_rule_favours_failing_arms(monkeypatch):
     monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
     found = practice(rule="success")
     np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
@@ -83,7 +83,7 @@ def test_success_practises_what_fails_once_it_is_believed(monkeypatch):
     assert rows[0]["wanted_share"] == 0.25  # what was in force, not what comes
 
 
-def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
+def test_arm_with_few_missions_uses_rate_of_its_kind() -> None:
     found = practice(rule="success")
     found.note(ended("blocked_aisle", True, 6, "partial"))
     found.note(ended("blocked_aisle", False, 1, "full"))
@@ -93,7 +93,7 @@ def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
     assert rates[0] == rates[1] == 1.0  # never driven
 
 
-def test_old_episodes_fade_by_their_half_life() -> None:
+def test_old_episodes_decay_with_half_life() -> None:
     found = practice(rule="success")
     found.note(ended("nominal", False, 200))
     found.note(ended("nominal", True, round(HALF_LIFE_EPISODES)))
@@ -114,7 +114,7 @@ def test_shares_move_at_interval_ends_within_the_limit() -> None:
     assert steps[1] <= MAX_CHANGE + 1e-9
 
 
-def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
+def test_unordered_merges_orders_into_their_kinds() -> None:
     order = MissionArm("missions[0] wheel_slip aisle_1", "wheel_slip", 0.5, order=0)
     whole = [MissionArm(arm.name, arm.kind, arm.share / 2, arm.block) for arm in ARMS]
     natural = {arm.name: arm.share for arm in unordered([*whole, order])}
@@ -122,7 +122,7 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
     assert sum(natural.values()) == pytest.approx(1.0)
 
 
-def test_success_of_a_task_without_a_goal_is_refused() -> None:
+def test_success_rule_needs_a_goal() -> None:
     with pytest.raises(ConfigError, match="the task has no goal"):
         Practice(PracticeConfig(rule="success"), ARMS, goal=False)
 
@@ -130,7 +130,7 @@ def test_success_of_a_task_without_a_goal_is_refused() -> None:
 PRACTICE = {"rule": "success"}
 
 
-def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
+def test_resume_with_other_arms_is_rejected(tmp_path: Path) -> None:
     first = session(tmp_path / "run", config(practice=PRACTICE))
     first.save()
     first.close()
@@ -154,7 +154,7 @@ def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same, whenever it is asked
 
 
-def test_an_order_is_an_arm_and_says_so() -> None:
+def test_mission_order_is_a_named_arm() -> None:
     orders = [MissionOrder(kind="near_collision", missions=2)]
     twin = WarehouseVectorEnv(1, missions=orders, missions_share=0.25, conditions={"nominal": 1})
     arms = twin.mission_arms()

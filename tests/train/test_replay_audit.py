@@ -34,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_every_sampled_row_is_a_record(run: Path) -> None:
+def test_every_audited_row_is_a_record(run: Path) -> None:
     records = replay_audit(run)
     audit = pq.read_table(run / "audit.parquet").sort_by(
         [("gradient_step", "ascending"), ("batch_row", "ascending")]
@@ -59,7 +59,7 @@ def test_every_sampled_row_is_a_record(run: Path) -> None:
         assert (record.age_days is None) == (row["source"] == "fresh")
 
 
-def test_one_clock_says_what_was_collected_before_the_last_sync(tmp_path, shell):
+def test_record_dates_rows_against_last_sync(tmp_path, shell):
     hard = {"rule": "hard", "every": 30}
     path = tmp_path / "hard"
     run_to_end(path, config(schedule={"env_steps": 800}, target=hard))
@@ -82,7 +82,7 @@ def test_one_clock_says_what_was_collected_before_the_last_sync(tmp_path, shell)
     assert by_record == sum(row["n"] for row in found if row["before"])
 
 
-def test_fresh_rows_have_ids_of_their_own(run: Path) -> None:
+def test_fresh_rows_have_unique_negative_ids(run: Path) -> None:
     audit = pq.read_table(run / "audit.parquet").sort_by(
         [("gradient_step", "ascending"), ("batch_row", "ascending")]
     )
@@ -97,7 +97,7 @@ def test_fresh_rows_have_ids_of_their_own(run: Path) -> None:
     assert len(fresh) == len(set(fresh.values())) > 100
 
 
-def test_the_view_is_the_record(run: Path, shell: Shell) -> None:
+def test_sql_view_equals_python_records(run: Path, shell: Shell) -> None:
     query = f"SELECT {', '.join(FIELDS)} FROM replay_audit LIMIT 40"
     shown = shell.json("sql", run, query)
     assert [ReplayAuditRecord(**row) for row in shown] == list(replay_audit(run)[:40])
@@ -109,7 +109,7 @@ def test_the_view_is_the_record(run: Path, shell: Shell) -> None:
     "actions",
     [load_profile("warehouse_amr").task.actions, ((0.0, 0.0), (-0.125, 0.3456), (12.0, -1 / 3))],
 )
-def test_a_store_names_actions_as_runs_do(tmp_path, actions):
+def test_store_and_run_name_actions_alike(tmp_path, actions):
     task = Task(body=load_profile("warehouse_amr").task.body, actions=actions)
     with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as store:
         text = store.connection.sql("SELECT sql FROM duckdb_views() WHERE view_name = 'actions'")

@@ -95,7 +95,7 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_cut_run_ends_as_an_undisturbed_one(case, tmp_path, monkeypatch):
+def test_interrupted_run_matches_uninterrupted_run(case, tmp_path, monkeypatch):
     monkeypatch.setattr("restock.train.feed.practice.INTERVAL_STEPS", 100)
     monkeypatch.setattr("restock.train.feed.practice.WARMUP_EPISODES", 2)
     changes, make_logs, teacher = CASES[case]
@@ -141,9 +141,7 @@ def resumed(path: Path, settings: TrainConfig) -> Session:
 
 
 @pytest.mark.parametrize("evaluation", one_in(2, [1, 2, 3]))
-def test_an_abandoned_evaluation_is_made_by_the_resumed_run(
-    undisturbed, settings, tmp_path, evaluation
-):
+def test_resume_repeats_abandoned_evaluation(undisturbed, settings, tmp_path, evaluation):
     """After the logs, among online updates, and at the end."""
     path = tmp_path / "a"
     live = session(path, settings)
@@ -162,7 +160,7 @@ def test_an_abandoned_evaluation_is_made_by_the_resumed_run(
     assert_same_run(undisturbed, resumed(path, settings))
 
 
-def test_a_killed_run_goes_on_from_its_checkpoint(undisturbed, settings, tmp_path):
+def test_killed_run_resumes_from_checkpoint(undisturbed, settings, tmp_path):
     class Killed(Exception):
         pass
 

@@ -21,7 +21,7 @@ def select_policies(run: Path) -> list[dict[str, object]]:
 
 
 @pytest.mark.parametrize("read", [read_policies, select_policies])
-def test_no_flipped_bit_of_a_table_is_read_in_silence(tmp_path, read):
+def test_flipped_bit_in_table_is_reported(tmp_path, read):
     run = Run.create(tmp_path / "a", {})
     counts = {"gradient_steps": 0, "source": "logs", "behaviour_policy": "planner"}
     counts |= {"rows": np.arange(40) ** 2, "env_steps": np.arange(40)}
@@ -44,20 +44,20 @@ def test_no_flipped_bit_of_a_table_is_read_in_silence(tmp_path, read):
     assert all("policies.parquet" in said for said in refused)
 
 
-def test_a_table_shorter_than_the_checkpoint_is_an_error(tmp_path: Path) -> None:
+def test_table_shorter_than_checkpoint_is_rejected(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     with pytest.raises(RunError, match=r"audit.parquet: has 0 rows, the checkpoint .* after 5"):
         run.truncate({"audit": 5})
 
 
-def test_every_column_of_every_table_is_documented() -> None:
+def test_every_table_column_is_documented() -> None:
     for name, schema in {**TABLES, "eval_episodes": EVAL_EPISODES}.items():
         assert schema.metadata[b"doc"], name
         for field in schema:
             assert field.metadata[b"meaning"], f"{name}.{field.name}"
 
 
-def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_existing_run_is_rejected_with_resume_hint(tmp_path: Path) -> None:
     Run.create(tmp_path / "a", {})
     with pytest.raises(RunError, match=r"already exists\n.*--resume"):
         Run.create(tmp_path / "a", {})
@@ -68,7 +68,7 @@ def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
     Run.create(tmp_path / "empty", {})  # an empty directory is free
 
 
-def test_a_place_where_no_run_can_be_made_or_stay_is_refused(tmp_path: Path) -> None:
+def test_run_inside_other_artifacts_is_rejected(tmp_path: Path) -> None:
     Run.create(tmp_path / "a", {})
     (tmp_path / "panel").mkdir()
     (tmp_path / "panel" / "panel.json").touch()
@@ -87,7 +87,7 @@ def test_a_place_where_no_run_can_be_made_or_stay_is_refused(tmp_path: Path) -> 
     check_free(tmp_path / "new" / "b")
 
 
-def test_a_directory_that_is_no_run_is_refused(tmp_path: Path) -> None:
+def test_invalid_run_directory_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"no config\.json"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text('{"format": "restock-run/999"}')

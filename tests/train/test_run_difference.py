@@ -11,7 +11,7 @@ from restock.train.judge.compare import diff_runs
 from restock.train.run.run import Run
 
 
-def test_what_moved_is_shown_where_compare_refuses(tmp_path, capsys):
+def test_diff_shows_changes_of_incomparable_runs(tmp_path, capsys):
     a = make_run(tmp_path / "a", document(0), success=0.2)
     b = make_run(tmp_path / "b", document(1, config__network__layer_norm=False), success=0.7)
     assert main(["coverage", "diff", str(a), str(b)]) == 2
@@ -25,7 +25,7 @@ def test_what_moved_is_shown_where_compare_refuses(tmp_path, capsys):
     assert rows["wheel_slip"]["difference_low"] > 0
 
 
-def test_runs_that_share_no_episode_or_have_no_evaluation_are_not_paired(tmp_path: Path) -> None:
+def test_runs_without_common_episodes_are_not_paired(tmp_path: Path) -> None:
     first = Run.open(make_run(tmp_path / "a", document(0)))
     second = Run.open(make_run(tmp_path / "b", document(1), first_episode_seed=5))
     assert diff_runs(first, second)["evaluation"] == []
@@ -33,7 +33,7 @@ def test_runs_that_share_no_episode_or_have_no_evaluation_are_not_paired(tmp_pat
     assert diff_runs(first, young)["evaluation"] == []
 
 
-def test_runs_of_two_tasks_are_refused(tmp_path: Path) -> None:
+def test_runs_of_different_tasks_are_rejected(tmp_path: Path) -> None:
     first = Run.open(make_run(tmp_path / "a", document(0)))
     second = Run.open(make_run(tmp_path / "b", document(1, task_hash="other")))
     with pytest.raises(RunError, match="task other"):

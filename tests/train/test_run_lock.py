@@ -17,7 +17,7 @@ HOLDS = "import pathlib, sys, time; from restock.train.run.run import RunLock;"
 HOLDS += "lock = RunLock(pathlib.Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 
-def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path: Path) -> None:
+def test_lock_is_free_after_its_holder_is_killed(tmp_path: Path) -> None:
     run = tmp_path / "run"
     holder = subprocess.Popen([sys.executable, "-c", HOLDS, str(run)], stdout=subprocess.PIPE)
     with holder:
@@ -35,7 +35,7 @@ def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path: Path) ->
     assert not (run / LOCK).exists()
 
 
-def test_a_new_run_is_locked_too_and_can_be_read(tmp_path: Path) -> None:
+def test_locked_run_is_readable_but_not_writable(tmp_path: Path) -> None:
     lock = RunLock(tmp_path)
     Run.create(tmp_path, {})
     assert Run.open(tmp_path).table("audit").num_rows == 0
@@ -52,7 +52,7 @@ def test_a_new_run_is_locked_too_and_can_be_read(tmp_path: Path) -> None:
     with_another.release()
 
 
-def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
+def test_file_system_without_locks_is_accepted(tmp_path, monkeypatch):
     def refuse(*_: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 

@@ -35,7 +35,7 @@ def controller(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -
     return ShareController(mixture, strata, planned, **more)
 
 
-def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
+def test_shares_respect_replay_cap_of_planned_draws() -> None:
     text = "max_replays_per_row = 50\nplanned_draws = 128\n" + HALVES
     # 100,000 online rows, half of them logs: 50,000; 100 rows x 50 are a tenth of that.
     plan = controller(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
@@ -64,7 +64,7 @@ def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     assert shrunk.logs_share == pytest.approx(0.3)
 
 
-def test_rows_that_bear_too_few_draws_bear_them_all() -> None:
+def test_capped_rows_are_used_up_over_the_run() -> None:
     """Check that missing draws are not asked for again at each new share."""
     plan = controller(
         f"max_replays_per_row=50\n{HALVES}", [100, 100], PlannedDraws(0, 128_000, 0, 1000)
@@ -93,7 +93,7 @@ def draws_of(panel: Panel, planned: PlannedDraws) -> LoggedSampler:
 
 
 @pytest.mark.parametrize("within", ["without_replacement", "uniform", "per"])
-def test_no_row_is_drawn_more_often_than_it_may_be(table, tmp_path, within):
+def test_no_row_exceeds_max_replays(table, tmp_path, within):
     text = f"max_replays_per_row = 9\nwithin = '{within}'\n[each_condition]\nshare = 'equal'\n"
     built = panel(table, tmp_path / "p", text)
     draws = draws_of(built, PlannedDraws(offline=4_000))
@@ -119,7 +119,7 @@ def test_no_row_is_drawn_more_often_than_it_may_be(table, tmp_path, within):
     assert draws.draw(64).rows.size == 0
 
 
-def test_surplus_of_a_used_up_stratum_goes_to_the_others(table: pa.Table, tmp_path: Path) -> None:
+def test_exhausted_stratum_gives_its_share_to_others(table: pa.Table, tmp_path: Path) -> None:
     text = "max_replays_per_row = 20\n[[strata]]\nname = 'near_collision'\nshare = 0.5\n"
     built = panel(table, tmp_path / "p", text + "[each_condition]\n")
     draws = draws_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
@@ -135,7 +135,7 @@ def test_surplus_of_a_used_up_stratum_goes_to_the_others(table: pa.Table, tmp_pa
     assert draws.controller.drawn[place] == before == limit
 
 
-def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> None:
+def test_weights_follow_current_shares(table: pa.Table, tmp_path: Path) -> None:
     """Full correction keeps P(outcome) what it was, however the shares move."""
     text = LIMITED.replace("density_ratio", "full")
     built = panel(table, tmp_path / "p", text)
@@ -177,7 +177,7 @@ def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Se
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
 
 
-def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> None:
+def test_run_records_current_shares(whole: tuple[Session, Panel]) -> None:
     live, built = whole
     path, size = live.run.path, len(built.strata)
     shares = pq.read_table(path / "shares.parquet").to_pylist()

@@ -25,7 +25,7 @@ def panel(store: Path) -> Panel:
 
 
 @pytest.mark.long
-def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
+def test_fresh_rows_match_sb3_nstep_buffer(tmp_path: Path) -> None:
     """Against Stable-Baselines3's own n-step buffer, fed the same steps."""
     from stable_baselines3.common.buffers import NStepReplayBuffer
 
@@ -65,7 +65,7 @@ def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("given", ["table", "store"])
-def test_sac_trains_on_the_continuous_face_with_logs(panel, store, tmp_path, given):
+def test_sac_trains_on_continuous_actions_with_logs(panel, store, tmp_path, given):
     commands = logged_commands(panel.path, store) if given == "store" else None
     fed = {"panel": panel.path, "run": tmp_path / "run", "commands": commands, "n_step": 3}
     model = sb3_model(
@@ -93,7 +93,7 @@ def test_sac_trains_on_the_continuous_face_with_logs(panel, store, tmp_path, giv
     assert all(row["td"] is None for row in audit)  # SAC keeps it to itself
 
 
-def test_weights_that_the_library_cannot_use_are_refused(store: Path, tmp_path: Path) -> None:
+def test_unusable_weights_are_rejected(store: Path, tmp_path: Path) -> None:
     weighted = make_panel(store, tmp_path / "panel", n_step=3, post="full")
     env = sb3_envs(1)
     arguments = (100, env.observation_space, env.action_space)
@@ -103,14 +103,14 @@ def test_weights_that_the_library_cannot_use_are_refused(store: Path, tmp_path: 
     assert len(unweighted.sample(3).rewards) == 3
 
 
-def test_a_panel_of_another_task_is_refused(store_path: Path, tmp_path: Path) -> None:
+def test_panel_of_another_task_is_rejected(store_path: Path, tmp_path: Path) -> None:
     other = make_panel(store_path, tmp_path / "other")
     env = sb3_envs(1)
     with pytest.raises(PanelError, match="its rows are of task"):
         MixtureReplayBuffer(100, env.observation_space, env.action_space, panel=other).sample(1)
 
 
-def test_a_blown_up_step_is_not_learnt_from() -> None:
+def test_invalid_step_is_not_stored() -> None:
     env = sb3_envs(1)
     buffer = MixtureReplayBuffer(100, env.observation_space, env.action_space, "cpu", 1)
     size = env.observation_space.shape[0]

@@ -76,7 +76,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_a_model_acts_without_its_panel_and_leaves_its_run_alone(saved, tmp_path):
+def test_loaded_model_predicts_without_its_panel(saved, tmp_path):
     saved.replay_buffer.close()
     before, observation = content(tmp_path / "run"), saved.env.reset()
     shutil.rmtree(tmp_path / "panel")
@@ -90,7 +90,7 @@ def test_a_model_acts_without_its_panel_and_leaves_its_run_alone(saved, tmp_path
     assert content(tmp_path / "run") == before
 
 
-def test_training_without_the_saved_buffer_leaves_its_run_alone(saved: Any, tmp_path: Path) -> None:
+def test_training_without_saved_buffer_is_rejected(saved: Any, tmp_path: Path) -> None:
     saved.replay_buffer.close()
     before = content(tmp_path / "run")
     model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")
@@ -99,7 +99,7 @@ def test_training_without_the_saved_buffer_leaves_its_run_alone(saved: Any, tmp_
     assert content(tmp_path / "run") == before
 
 
-def test_training_goes_on_in_the_same_run(saved: Any, tmp_path: Path, place: Places) -> None:
+def test_training_continues_in_the_saved_run(saved: Any, tmp_path: Path, place: Places) -> None:
     saved.learn(60, reset_num_timesteps=False)  # of which the saved buffer knows nothing
     saved.replay_buffer.close()
     model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")

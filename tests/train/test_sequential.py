@@ -40,14 +40,14 @@ def passing(differences: F64, error: float = 0.05) -> float:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
-def test_a_policy_at_the_margin_seldom_passes(correlation: float) -> None:
+def test_policy_at_margin_rarely_passes(correlation: float) -> None:
     runs = 600
     share = passing(paired(0.85, 0.9, correlation, (runs, 300)))
     assert wilson(round(share * runs), runs)[0] <= 0.05
     assert passing(paired(0.8, 0.9, correlation, (runs, 300))) == 0.0
 
 
-def test_a_sequence_decides_as_its_bets_do() -> None:
+def test_confidence_sequence_matches_its_bets() -> None:
     for row in paired(0.9, 0.9, 0.5, (5, 400)):
         sequence = ConfidenceSequence(1.0, -MARGIN, variance=VARIANCE)
         for difference in row:
@@ -57,7 +57,7 @@ def test_a_sequence_decides_as_its_bets_do() -> None:
 
 
 @given(st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=60))
-def test_bounds_only_come_closer(differences: list[float]) -> None:
+def test_bounds_only_tighten(differences: list[float]) -> None:
     sequence = ConfidenceSequence(2.0, -0.1, variance=0.1)
     for difference in differences:
         sequence.add(difference)
@@ -68,7 +68,7 @@ def test_bounds_only_come_closer(differences: list[float]) -> None:
     assert sequence.high[-1] <= 2.0
 
 
-def test_pairs_needed_is_the_least_budget_that_decides() -> None:
+def test_pairs_needed_is_smallest_deciding_budget() -> None:
     needed = pairs_needed(1.0, -MARGIN, variance=VARIANCE)
     sequence = ConfidenceSequence(1.0, -MARGIN, variance=VARIANCE)
     for _ in range(needed - 1):

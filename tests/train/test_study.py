@@ -54,9 +54,7 @@ def no_references(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(
-    tmp_path: Path, capsys, shell: Shell
-) -> None:
+def test_study_runs_each_arm_once_and_compares(tmp_path: Path, capsys, shell: Shell) -> None:
     (tmp_path / "s.toml").write_text(SMALL)
     out = tmp_path / "out"
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
@@ -78,7 +76,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(
 
 
 @pytest.mark.long
-def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, shell: Shell) -> None:
+def test_failed_run_names_its_log_file(tmp_path: Path, shell: Shell) -> None:
     text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)
     said = " ".join(shell.err("train", tmp_path / "s.toml", "--out", tmp_path / "o").split())
@@ -86,7 +84,7 @@ def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, shell: Shell)
     assert "nowhere.toml" in said
 
 
-def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, shell: Shell) -> None:
+def test_dry_run_lists_the_runs(tmp_path: Path, shell: Shell) -> None:
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 7]"))
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
     rows = json.loads(shell.out(*argv))
@@ -98,9 +96,7 @@ def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, shell: Shell) 
     assert not (tmp_path / "o").exists()
 
 
-def test_an_arm_may_have_a_baseline_and_a_treatment_of_its_own(
-    tmp_path: Path, shell: Shell
-) -> None:
+def test_arm_may_set_baseline_and_treatment(tmp_path: Path, shell: Shell) -> None:
     # coverage against uniform as mixtures; the same mixture with a margin, as an algorithm.
     (tmp_path / "s.toml").write_text("""
 treatment = "mixture"
@@ -134,7 +130,7 @@ def trained_before(tmp_path: Path, text: str) -> Path:
     return tmp_path / "out"
 
 
-def test_a_changed_study_says_what_is_different(tmp_path: Path, shell: Shell) -> None:
+def test_changed_study_reports_differences(tmp_path: Path, shell: Shell) -> None:
     study = tmp_path / "s.toml"
     arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
     text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
@@ -148,7 +144,7 @@ def test_a_changed_study_says_what_is_different(tmp_path: Path, shell: Shell) ->
     assert 'then panel = "p", now panel = "q"' in " ".join(shell.err(*line).split())
 
 
-def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
+def test_comparisons_use_treatment_of_their_arm(tmp_path: Path, capsys, monkeypatch) -> None:
     out = trained_before(tmp_path, TWICE)
     dueling = Difference("config.network.layer_norm", "algorithm", True, False)
 
@@ -172,7 +168,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     assert "Not held: the algorithm (network.layer_norm)." in page
 
 
-def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, monkeypatch, shell: Shell) -> None:
+def test_failed_comparison_does_not_stop_study(tmp_path: Path, monkeypatch, shell: Shell) -> None:
     out = trained_before(tmp_path, TWICE)
 
     def compared(first, second, *, treatment):
@@ -196,7 +192,7 @@ def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, monkeypatch, shel
         ("schedule.env_steps = 2_000", "and it has no logs"),
     ],
 )
-def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -> None:
+def test_arm_without_updates_is_rejected(tmp_path, settings, said) -> None:
     study = f"store = 's'\n[settings]\n{settings}\n"
     (tmp_path / "s.toml").write_text(study + TWO)
     with pytest.raises(ConfigError) as refused:
@@ -211,7 +207,7 @@ def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interrupted):
+def test_no_run_starts_after_a_failure(tmp_path, capsys, monkeypatch, interrupted):
     begun, running, ended = [], Event(), Event()
 
     def job(plan, job, say):
@@ -240,7 +236,7 @@ def test_after_a_failed_run_none_is_begun(tmp_path, capsys, monkeypatch, interru
     assert "here: ran out of disk" in said
 
 
-def test_a_dry_run_plans_the_mixtures(tmp_path: Path, shell: Shell) -> None:
+def test_dry_run_checks_mixtures(tmp_path: Path, shell: Shell) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\nmixture = "b.toml"\n'
     (tmp_path / "s.toml").write_text(f'store = "s"\ntreatment = "mixture"\n{arms}')
     (tmp_path / "b.toml").write_text("where = 'speed > 1'\n[each_condition]\n")
@@ -281,7 +277,7 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, shell: Shell) -> None:
         ),
     ],
 )
-def test_an_invalid_study_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_study_is_rejected(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "s.toml").write_text(text)
     with pytest.raises(ConfigError, match=said):
         load_study(tmp_path / "s.toml")

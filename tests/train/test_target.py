@@ -16,7 +16,7 @@ class One(nn.Module):
         self.value = nn.Parameter(torch.tensor([value], dtype=torch.float64))
 
 
-def test_the_two_clocks() -> None:
+def test_hard_target_of_two_clocks_example() -> None:
     """One state with a self-loop (reward 1, discount .5) closes on 1 before the sync."""
     online, target = One(0.0), One(0.0)
     clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
@@ -59,7 +59,7 @@ def test_value_lag_by_hand() -> None:
     assert value_lag(q, slow) == pytest.approx(1.0 / 2.0)
 
 
-def test_a_rule_says_its_effective_lag() -> None:
+def test_rule_describes_its_effective_lag() -> None:
     assert describe(Polyak(tau=0.005)) == {
         "rule": "polyak",
         "tau": 0.005,

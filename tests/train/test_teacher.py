@@ -34,7 +34,7 @@ STOP, FORWARD, BACK = range(3)
 
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
-def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, seed: int) -> None:
+def test_plausible_actions_match_probability_ratio(ratio: float, seed: int) -> None:
     logits = torch.randn(6, 4, generator=torch.Generator().manual_seed(seed)).double()
     found = plausible_actions(logits, tensor(ratio, dtype=torch.float64))
     probability = logits.softmax(dim=1)
@@ -45,7 +45,7 @@ def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, see
     assert bool(found.gather(1, probability.argmax(dim=1, keepdim=True)).all())
 
 
-def test_imitation_is_cross_entropy_over_answered_states() -> None:
+def test_imitation_loss_skips_unlabelled_states() -> None:
     logits = tensor([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8], [0.2, 0.2, 0.6]]).log() + 2.5
     expected = -(np.log(0.5) + np.log(0.6)) / 2
     assert float(imitation_loss(logits, tensor([0, UNKNOWN, 2]))) == pytest.approx(expected)
@@ -65,7 +65,7 @@ def rows(seed: int) -> Tensor:
     return packed
 
 
-def test_unlikely_actions_are_neither_taken_nor_targeted() -> None:
+def test_implausible_actions_are_not_chosen_or_bootstrapped() -> None:
     one = learner()
     behaviour = one.behaviour
     assert behaviour is not None
@@ -96,7 +96,7 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return run_to_end(path, config(**TAUGHT), teacher=forward)
 
 
-def test_every_step_has_the_teachers_answer_for_its_own_state(taught: Any) -> None:
+def test_each_step_stores_teacher_action_of_its_state(taught: Any) -> None:
     ring, count = taught.ring, len(taught.ring)
     label = ring.meta["teacher_action"][:count]
     first = ring.rows[:count, 0] == 1
@@ -111,7 +111,7 @@ def test_every_step_has_the_teachers_answer_for_its_own_state(taught: Any) -> No
     assert probability[~chosen].max() == pytest.approx(epsilon / 3)  # explores over all actions
 
 
-def test_logged_rows_alone_make_a_filter_before_the_first_step(tmp_path: Path) -> None:
+def test_offline_cloning_filters_actions_before_driving(tmp_path: Path) -> None:
     teacher = {"source": "logs", "ratio": 0.5, "offline_updates": 200}
     live = session(tmp_path / "a", config(teacher=teacher, schedule={"env_steps": 4}))
     assert live.imitation is not None
@@ -129,7 +129,7 @@ def test_logged_rows_alone_make_a_filter_before_the_first_step(tmp_path: Path) -
     live.close()
 
 
-def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> None:
+def test_cloned_rows_are_drawn_by_stratum_shares(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config(teacher={"source": "logs"}))
     imitation, shelf = live.imitation, logs()
     assert imitation is not None
@@ -141,7 +141,7 @@ def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> 
     live.close()
 
 
-def test_half_of_the_rows_are_mirrored_with_their_action(tmp_path: Path) -> None:
+def test_half_of_imitation_rows_are_mirrored(tmp_path: Path) -> None:
     task = load_profile("warehouse_amr").task
     ring = FreshRing(
         4,
@@ -178,7 +178,7 @@ def test_half_of_the_rows_are_mirrored_with_their_action(tmp_path: Path) -> None
     assert np.array_equal(ring.rows[:, ring.columns["observation"]], observed)
 
 
-def test_rows_are_mirrored_if_the_operator_teaches(tmp_path):
+def test_mirroring_defaults_to_on_for_operator_teacher(tmp_path):
     def mirror(*settings: str) -> bool | None:
         return prepare_new(tmp_path / "run", None, None, settings).config.teacher.mirror
 
@@ -209,7 +209,7 @@ def test_rows_are_mirrored_if_the_operator_teaches(tmp_path):
         ([[1], [1, 2], [0], [1]], "returned a list that is not an array"),
     ],
 )
-def test_a_teacher_that_gives_no_action_is_refused(answer, message, tmp_path):
+def test_invalid_teacher_answers_are_rejected(answer, message, tmp_path):
     live = session(tmp_path / "a", config(**TAUGHT), teacher=lambda env, observation: answer)
     with pytest.raises(ConfigError, match=message):
         train(live)
@@ -242,7 +242,7 @@ class Made:
         ("unreadable:act", "importing unreadable:act raised SyntaxError", 2),
     ],
 )
-def test_an_error_of_the_users_teacher_names_its_line(source, message, line, tmp_path, monkeypatch):
+def test_teacher_exception_reports_file_and_line(source, message, line, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(TEACHERS)
     (tmp_path / "unreadable.py").write_text("\ndef act(:\n")
     monkeypatch.chdir(tmp_path)
@@ -254,7 +254,7 @@ def test_an_error_of_the_users_teacher_names_its_line(source, message, line, tmp
     assert str(refused.value.where).endswith(f"{file}:{line}")
 
 
-def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(tmp_path: Path) -> None:
+def test_run_resumes_after_teacher_failure(tmp_path: Path) -> None:
     calls = 0
 
     def late(env: Any, observation: np.ndarray) -> np.ndarray | None:
@@ -280,7 +280,7 @@ def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(tmp_path: Path) -> 
     )
 
 
-def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
+def test_unusable_teachers_are_rejected(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config(teacher={"source": "operator"}))
     with pytest.raises(ConfigError, match="needs the warehouse twin, but this is a ToyTwin"):
         train(live)
@@ -299,13 +299,13 @@ def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
     ("parts", "message"),
     [({"logs": None}, "this run has no logs"), ({}, "the logs have planner, operator\n")],
 )
-def test_logs_without_a_row_to_clone_are_refused(parts, message, tmp_path):
+def test_missing_rows_to_clone_are_rejected(parts, message, tmp_path):
     settings = config(teacher={"source": "logs", "policies": ["teleop"]})
     with pytest.raises(ConfigError, match=f"clones the rows of teleop, but {message}"):
         session(tmp_path / "a", settings, **parts)
 
 
-def test_the_record_says_what_the_filter_did(taught: Any) -> None:
+def test_teacher_table_records_filter_statistics(taught: Any) -> None:
     rows = taught.run.table("teacher").to_pylist()
     assert {(row["source"], row["condition"]) for row in rows} >= {
         ("logs", "nominal"),
@@ -324,7 +324,7 @@ def test_the_record_says_what_the_filter_did(taught: Any) -> None:
     assert near[-1] < near[0]
 
 
-def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:
+def test_operator_teacher_restores_its_state() -> None:
     task = load_profile("warehouse_amr").task
     teacher = open_teacher(TeacherConfig(source="operator"), task, seed=0)
     assert teacher is not None
@@ -348,7 +348,7 @@ def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:
     assert len({action for answers in first for action in answers}) > 1
 
 
-def test_the_operator_teaches_where_there_is_a_goal(tmp_path: Path) -> None:
+def test_operator_is_default_teacher_for_goal_tasks(tmp_path: Path) -> None:
     def source(*settings: str) -> str | None:
         return prepare_new(tmp_path / "run", None, None, settings).config.teacher.source
 

@@ -60,7 +60,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, panel: Path) -> Path:
     return path
 
 
-def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
+def test_config_json_records_panel_task_and_versions(trained: Path, panel: Path) -> None:
     document = json.loads((trained / "config.json").read_text())
     header = json.loads((panel / "panel.json").read_text())
     assert document["panel"]["id"] == header["id"]
@@ -81,7 +81,7 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
 
 
-def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> None:
+def test_online_batches_are_half_logged_rows(trained: Path) -> None:
     progress = pq.read_table(trained / "progress.parquet").to_pylist()
     assert list(dict.fromkeys(row["phase"] for row in progress)) == ["offline", "warmup", "online"]
     shares = {row["phase"]: row["logs_share"] for row in progress if row["updates"]}
@@ -90,7 +90,7 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
 
 
-def test_logs_of_264_days_are_264_days_old(trained: Path) -> None:
+def test_age_of_logs_counts_from_run_start(trained: Path) -> None:
     """When the run began, not beside the newest of their store."""
     audit = pq.read_table(trained / "audit.parquet").to_pylist()
     assert all(264 < row["age_days"] < 265 for row in audit if row["source"] == "logs")
@@ -99,7 +99,7 @@ def test_logs_of_264_days_are_264_days_old(trained: Path) -> None:
     assert all(264 < row["p50"] < 265 for row in days)
 
 
-def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys, shell):
+def test_unfillable_quota_is_warned_about(tmp_path, capsys, shell):
     task = load_profile("warehouse_amr").task
     text = (
         "max_replays_per_row = 4\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
@@ -124,7 +124,7 @@ def test_quota_that_nothing_can_fill_is_named_first(tmp_path, capsys, shell):
 
 
 @pytest.mark.long  # test_loop shows it on the corridor
-def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, shell):
+def test_resume_in_twin_is_bit_exact(tmp_path, panel, shell):
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
@@ -153,7 +153,7 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path, panel, shell):
     assert whole["exploration"] == parts["exploration"]
 
 
-def test_a_run_that_is_being_trained_is_not_resumed(trained, shell):
+def test_locked_run_is_not_resumed(trained, shell):
     before = {file: file.read_bytes() for file in trained.rglob("*.safetensors")}
     lock = RunLock(trained)
     assert f"is being trained by process {os.getpid()}" in shell.err(
@@ -165,7 +165,7 @@ def test_a_run_that_is_being_trained_is_not_resumed(trained, shell):
 
 @pytest.mark.long
 @pytest.mark.parametrize("ended_by", one_in(2, [signal.SIGINT, signal.SIGTERM]))
-def test_ctrl_c_or_a_kill_writes_a_checkpoint(ended_by: signal.Signals, tmp_path: Path) -> None:
+def test_sigint_and_sigterm_write_a_checkpoint(ended_by: signal.Signals, tmp_path: Path) -> None:
     path = tmp_path / "a"
     command = [sys.executable, "-m", "restock", "train", "--out", str(path), *TINY]
     process = subprocess.Popen(
@@ -193,7 +193,7 @@ def test_ctrl_c_or_a_kill_writes_a_checkpoint(ended_by: signal.Signals, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [3, 6, 9])
-def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: int) -> None:
+def test_killed_run_resumes_bit_exactly(tmp_path: Path, rows: int) -> None:
     settings = [*TINY, "--env-steps", "800", "--set", "record.checkpoint_every_env_steps=120"]
     assert main(["train", "--out", str(tmp_path / "whole"), *settings]) == 0
     path = tmp_path / "killed"
@@ -245,7 +245,7 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
         (["eval", "{trained}", "--episodes", "-1"], "must be at least 1"),
     ],
 )
-def test_wrong_input_gives_one_clear_message_and_writes_nothing(
+def test_invalid_arguments_are_rejected_before_writing(
     argv, complaint, trained, panel, tmp_path, shell
 ):
     if "cuda" in argv and torch.cuda.is_available():
@@ -258,7 +258,7 @@ def test_wrong_input_gives_one_clear_message_and_writes_nothing(
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(trained, panel, tmp_path, shell):
+def test_moved_panel_is_found_through_symlink(trained, panel, tmp_path, shell):
     run, moved = tmp_path / "run", tmp_path / "moved"
     shutil.copytree(trained, run)
     text = (run / "config.json").read_text().replace(str(panel), str(tmp_path / "panel"))
@@ -270,7 +270,7 @@ def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(trained, panel, tmp_pa
     assert main(resume) == 0
 
 
-def test_a_panel_of_a_task_that_no_profile_has_is_refused(tmp_path, shell):
+def test_panel_of_unknown_task_is_rejected(tmp_path, shell):
     build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
     said = shell.err(*argv)
@@ -283,14 +283,14 @@ def test_a_panel_of_a_task_that_no_profile_has_is_refused(tmp_path, shell):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_dry_run_writes_nothing(tmp_path, panel, shell):
+def test_dry_run_writes_nothing(tmp_path, panel, shell):
     argv = ["train", "--panel", str(panel), "--out", str(tmp_path / "run"), "--seed", "7"]
     shown = json.loads(shell.out(*argv, "--dry-run"))
     assert shown["config"]["seed"] == 7
     assert not (tmp_path / "run").exists()
 
 
-def test_the_docs_list_every_key_of_the_config_with_its_default() -> None:
+def test_docs_list_every_config_key_and_default() -> None:
     def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         found: dict[str, Any] = {}
         for name, value in values.items():

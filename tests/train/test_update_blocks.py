@@ -62,7 +62,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_updates_in_blocks_are_those_one_by_one(way: str, device: str, tmp_path: Path) -> None:
+def test_blocks_match_single_updates(way: str, device: str, tmp_path: Path) -> None:
     """What is fed, to the bit; what is learnt, but for rounding."""
     changes = {**WAYS[way], "schedule": OFFLINE}
     one = run_to_end(tmp_path / "one", config(**changes))
@@ -82,7 +82,7 @@ def test_updates_in_blocks_are_those_one_by_one(way: str, device: str, tmp_path:
     assert fed["sampled_episodes"].equals(expected_fed["sampled_episodes"])
 
 
-def test_a_run_in_blocks_is_the_run_one_by_one(tmp_path: Path) -> None:
+def test_online_run_in_blocks_matches_single_updates(tmp_path: Path) -> None:
     """Online too: the ring, the target's clock, the intervals and what is recorded."""
     short = {"schedule": {"env_steps": 800}}
     one = run_to_end(tmp_path / "one", config(**short))
@@ -98,7 +98,7 @@ def test_a_run_in_blocks_is_the_run_one_by_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path) -> None:
+def test_run_in_blocks_is_repeatable_and_resumable(device: str, tmp_path: Path) -> None:
     whole = trained(in_blocks(tmp_path / "whole", device))
     assert_same_run(whole, trained(in_blocks(tmp_path / "again", device)))
     stopped = in_blocks(tmp_path / "stopped", device)
@@ -110,7 +110,7 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
     assert_same_run(whole, resumed)
 
 
-def test_priorities_feed_blocks_as_they_feed_one_by_one(device, tmp_path):
+def test_priorities_feed_blocks_like_single_updates(device, tmp_path):
     """A draw follows the TD errors before it."""
     text = "discount = 0.9\nwithin = 'per'\n[each_condition]\nshare = 'equal'\n"
     table = recording_transitions(1, task=TASK)
@@ -128,7 +128,7 @@ def test_priorities_feed_blocks_as_they_feed_one_by_one(device, tmp_path):
         assert of_logs[0].select(rows).equals(of_logs[1].select(rows))
 
 
-def test_rows_on_the_device_follow_the_ring(device: str) -> None:
+def test_device_table_follows_the_ring(device: str) -> None:
     ring = FreshRing(64, 4, TASK.observation_size, discount=0.9, n_step=2)
     shelf = logs()
     table = DeviceTable(shelf.rows, ring, torch.device(device))
@@ -152,7 +152,7 @@ def test_rows_on_the_device_follow_the_ring(device: str) -> None:
             np.testing.assert_array_equal(table.rows[table.logs :].cpu(), ring.rows)
 
 
-def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Path) -> None:
+def test_nonfinite_learner_names_its_update(device: str, tmp_path: Path) -> None:
     shelf = logs()
     shelf.rows[7, 2] = torch.nan
     live = session(tmp_path / "run", config(device=device, schedule=OFFLINE), logs=shelf)

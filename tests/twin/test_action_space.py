@@ -12,13 +12,13 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
 @pytest.mark.parametrize("action", ["discrete", "continuous"])
-def test_each_action_space_passes_gymnasiums_checker(action: str) -> None:
+def test_action_spaces_pass_gymnasium_checker(action: str) -> None:
     made = gymnasium.make("restock/Warehouse-v0", render_mode="rgb_array", action=action)
     check_env(made.unwrapped)
 
 
 @pytest.mark.parametrize("action", ["discrete", "continuous"])
-def test_make_vec_gives_the_native_environment(action: str) -> None:
+def test_make_vec_returns_native_environment(action: str) -> None:
     made = gymnasium.make_vec(
         "restock/Warehouse-v0",
         num_envs=3,
@@ -38,14 +38,14 @@ def test_make_vec_gives_the_native_environment(action: str) -> None:
     assert ("action" in info) == (action == "continuous")
 
 
-def test_the_space_is_what_the_tasks_actions_span_in_their_units() -> None:
+def test_continuous_space_spans_task_actions() -> None:
     made = WarehouseVectorEnv(1, action="continuous")
     table = np.array(made.task.actions, np.float32)
     np.testing.assert_array_equal(made.single_action_space.low, table.min(axis=0))
     np.testing.assert_array_equal(made.single_action_space.high, table.max(axis=0))
 
 
-def test_a_command_of_the_table_does_what_its_index_does() -> None:
+def test_table_command_equals_its_index() -> None:
     discrete, continuous = WarehouseVectorEnv(4), WarehouseVectorEnv(4, action="continuous")
     np.testing.assert_array_equal(discrete.reset(seed=3)[0], continuous.reset(seed=3)[0])
     table = np.array(discrete.task.actions)
@@ -59,7 +59,7 @@ def test_a_command_of_the_table_does_what_its_index_does() -> None:
             np.testing.assert_allclose(left, right, atol=2e-4)  # float32 commands
 
 
-def test_a_command_that_is_no_number_is_refused() -> None:
+def test_nan_command_is_rejected() -> None:
     made = WarehouseVectorEnv(2, action="continuous")
     made.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1 of the twin: an action must be two"):
@@ -67,7 +67,7 @@ def test_a_command_that_is_no_number_is_refused() -> None:
 
 
 @pytest.mark.parametrize("index", [-1, 10, 0.7, np.nan])
-def test_an_index_outside_the_table_is_refused(index: float) -> None:
+def test_action_index_out_of_range_is_rejected(index: float) -> None:
     """-1 drove the last action, and .7 the first."""
     made = WarehouseVectorEnv(2)
     made.reset(seed=0)

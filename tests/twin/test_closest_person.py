@@ -43,7 +43,7 @@ def closest(
 
 @settings(max_examples=60)
 @given(places, places, angles, places, places, angles, st.booleans())
-def test_the_distance_is_that_of_the_outlines(x, y, yaw, px, py, heading, truck):
+def test_distance_matches_outlines(x, y, yaw, px, py, heading, truck):
     found = closest((x, y, yaw), {PEOPLE if truck else 0: (px, py, heading)}).closest_m[0]
     mine = outline(x, y, yaw, ROBOT_HALF_M)
     if truck:
@@ -56,7 +56,7 @@ def test_the_distance_is_that_of_the_outlines(x, y, yaw, px, py, heading, truck)
     assert found <= max(true, 0) + 2e-3
 
 
-def test_the_least_distance_is_kept_without_who_is_hidden() -> None:
+def test_hidden_people_do_not_count_as_closest() -> None:
     traffic = closest((0.0, 0.0, 0.0), {0: (1.6, 0.0, 0.0), 1: (0.0, 2.5, 0.0)})
     assert traffic.closest_m[0] == pytest.approx(1.6 - 0.35 - PERSON_RADIUS_M)
     traffic.position_m[0, 0] = (9.0, 9.0)

@@ -77,7 +77,7 @@ def recorded(profile: Profile, folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_latency_and_gain_of_a_robot_that_steers_come_back(tmp_path, capsys):
+def test_latency_and_gain_of_steering_robot_are_recovered(tmp_path, capsys):
     profile = profile_of(CAR, OUTLINE)
     (tmp_path / "own.toml").write_text(profile_toml(profile))
     bag = recorded(profile, tmp_path / "bag")

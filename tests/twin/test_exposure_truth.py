@@ -20,7 +20,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 STORED = [signal.name for signal in STORED_SIGNALS]
 
 
-def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
+def test_truth_limits_follow_robot_size() -> None:
     small = Task(
         body=Body(0.2, 0.2),
         actions=((0.0, 0.0), (0.2, 0.0)),
@@ -42,7 +42,7 @@ def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
 
 
 @pytest.mark.long
-def test_what_is_true_lies_at_its_cause_and_rules_find_it() -> None:
+def test_truth_matches_cause_and_rules_find_it() -> None:
     """Compare what is there with the mission, and with what is sensed."""
     reported: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}

@@ -89,7 +89,7 @@ def log(known: Path) -> Iterator[LoggedSegments]:
         yield log_segments(logged_steps(store), 2.0)
 
 
-def test_every_step_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> None:
+def test_each_step_is_in_a_segment_or_has_a_reason(known: Path) -> None:
     with Store(known) as store:
         found = log_segments(logged_steps(store), 2.0)
         rows = store.sql("SELECT count(*) FROM transitions").fetchall()[0][0]
@@ -100,7 +100,7 @@ def test_every_step_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> No
     assert np.abs(lasts * 1e-9 - 2.0).max() < 0.05
 
 
-def test_a_late_pose_or_tick_moves_segments_on(known: Path) -> None:
+def test_late_pose_or_tick_shifts_segments(known: Path) -> None:
     """Keep segments if poses come in bursts, as a Neato's do."""
     with Store(known) as store:
         steps = logged_steps(store)
@@ -120,7 +120,7 @@ def test_a_late_pose_or_tick_moves_segments_on(known: Path) -> None:
     assert moved.left_out["ticks not a control period apart"] == usual.row[0] + 4 - usual.row[0]
 
 
-def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path) -> None:
+def test_noiseless_recording_is_replayed_exactly(noiseless: Path) -> None:
     with Store(noiseless) as store:
         found = log_segments(logged_steps(store), 3.0)
     free = found.take(~found.signals["bumped"].any(axis=1))
@@ -132,7 +132,7 @@ def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path
     assert np.abs(speed).max() < 0.01
 
 
-def test_between_two_latencies_a_residual_lies_between(log: LoggedSegments) -> None:
+def test_residuals_interpolate_between_latencies(log: LoggedSegments) -> None:
     low, middle, high = ReplayResiduals(log.take(np.arange(4)), ("wheel speed",)).of(
         [Perturbation(latency_s=value) for value in (0.11, 0.1125, 0.12)]
     )["wheel speed"]
@@ -191,7 +191,7 @@ def test_friction_under_standing_wheels_is_not_identified(log: LoggedSegments) -
     assert lost.note == "0.05 to 2 explain the log as well (wheels slide in 0.0% of the steps)"
 
 
-def test_a_schedule_of_several_fits_spans_what_all_identified(tmp_path: Path) -> None:
+def test_fleet_schedule_spans_identified_parameters(tmp_path: Path) -> None:
     def one(gain: float, friction: bool) -> FittedTwin:
         perturbation = Perturbation(name="one", gain=gain, friction_scale=0.5)
         return FittedTwin(
@@ -230,7 +230,7 @@ def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments
     }
 
 
-def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
+def test_held_out_segments_are_later_and_disjoint(log: LoggedSegments) -> None:
     before, after = split_at(log, held_out_from(log, 0.25, seed=0))
     assert before.any()
     assert after.any()
@@ -239,7 +239,7 @@ def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
     assert stamps[before].max() <= stamps[after].min()
 
 
-def test_what_cannot_be_fitted_is_named(known: Path, shell: Shell) -> None:
+def test_invalid_fit_requests_are_rejected(known: Path, shell: Shell) -> None:
     for words, error in (
         (("--parameters", "gain,grip"), "'grip' cannot be fitted"),
         (("--parameters", " ,"), "'' cannot be fitted"),
@@ -261,7 +261,7 @@ def test_what_cannot_be_fitted_is_named(known: Path, shell: Shell) -> None:
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/bags")
-def test_another_robot_is_fitted_only_in_what_it_shares(tmp_path: Path) -> None:
+def test_other_robot_rejects_stand_in_parameters(tmp_path: Path) -> None:
     bag = BAGS / "turtlebot3-sim-humble"
     ingest(bag, load_profile("turtlebot3"), store=StoreWriter(tmp_path / "store"))
     with Store(tmp_path / "store") as store:
@@ -272,7 +272,7 @@ def test_another_robot_is_fitted_only_in_what_it_shares(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
+def test_all_parameters_of_known_robot_are_recovered(tmp_path: Path) -> None:
     true = msgspec.structs.replace(
         KNOWN,
         friction_scale=0.275,  # of .8: .22
@@ -298,7 +298,7 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
 
 
-def test_the_command_prints_json(known, monkeypatch, shell: Shell) -> None:
+def test_fit_command_prints_json(known, monkeypatch, shell: Shell) -> None:
     of = "restock.train.twin.calibration.fit.FitConfig"
     monkeypatch.setattr(of, partial(FitConfig, search_points=2))
     line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]

@@ -54,7 +54,7 @@ KINDS_OF_FLOOR = st.sampled_from(sorted(RECIPES))
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
 @settings(max_examples=20)
-def test_every_goal_of_a_generated_floor_is_reached(seed: int, kind: str) -> None:
+def test_goals_of_generated_floor_are_reachable(seed: int, kind: str) -> None:
     floor = generate(seed, RECIPES[kind])
     assert floor == generate(seed, RECIPES[kind])
     planner = Planner(floor)
@@ -67,7 +67,7 @@ def test_every_goal_of_a_generated_floor_is_reached(seed: int, kind: str) -> Non
         assert segment.width_m >= RECIPES[kind].aisle_m[0] - 1e-6
 
 
-def test_the_splits_share_no_floor() -> None:
+def test_splits_are_disjoint() -> None:
     floors = {split: {f.hash for f in open_floors(f"generated:{split}:40")} for split in SPLITS}
     assert all(len(hashes) == 40 for hashes in floors.values())
     assert not floors["train"] & floors["test"]
@@ -81,7 +81,7 @@ def test_the_splits_share_no_floor() -> None:
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
 @settings(max_examples=6)
-def test_a_floor_survives_toml(seed, kind, tmp_path_factory):
+def test_floor_round_trips_through_toml(seed, kind, tmp_path_factory):
     folder = tmp_path_factory.mktemp("floor")
     floor = replace(generate(seed, RECIPES[kind]), map_origin=(-3.0, 2.0, 0.5))
     write_floor(floor, folder / "floor.toml")
@@ -90,7 +90,7 @@ def test_a_floor_survives_toml(seed, kind, tmp_path_factory):
 
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize("negate", [0, 1])
-def test_every_mode_of_a_map_reads_the_same_free_space(tmp_path, mode, negate):
+def test_map_modes_give_equal_free_space(tmp_path, mode, negate):
     free = np.zeros((80, 120), np.bool_)
     free[10:70, 10:110] = True
     free[30:50, 40:80] = False
@@ -112,7 +112,7 @@ def test_every_mode_of_a_map_reads_the_same_free_space(tmp_path, mode, negate):
     assert floor.map_origin == pytest.approx((2.0, 3.0, 0.0))
 
 
-def test_a_map_turned_by_its_origin_goes_back_to_the_map(tmp_path: Path) -> None:
+def test_rotated_map_origin_is_kept(tmp_path: Path) -> None:
     Image.fromarray(np.pad(np.full((40, 60), 254, np.uint8), 10)).save(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text(
         f"image: map.pgm\nresolution: 0.1\norigin: [5.0, 0.0, {np.pi / 2}]\n"
@@ -139,7 +139,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],
 )
-def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, message: str) -> None:
+def test_invalid_map_image_is_rejected(tmp_path: Path, data: bytes, message: str) -> None:
     (tmp_path / "map.pgm").write_bytes(data)
     (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with pytest.raises(ConfigError, match=message):
@@ -157,7 +157,7 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
         ("image: [\n", "YAML"),
     ],
 )
-def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_map_yaml_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "map.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
         read_map(tmp_path / "map.yaml")
@@ -170,14 +170,14 @@ def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, me
         *("no.toml", "no.yaml", "default,default", "generated:" + "9" * 30),
     ],
 )
-def test_an_invalid_layout_is_refused(text: str) -> None:
+def test_invalid_layout_is_rejected(text: str) -> None:
     with pytest.raises(ConfigError):
         open_floors(text)
     with pytest.raises(ConfigError):
         open_floor("generated:train")
 
 
-def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> None:
+def test_floor_of_racks_gets_aisles_and_goals(tmp_path: Path) -> None:
     known = default_warehouse()
     racks = [[r.x_min, r.y_min, r.x_max, r.y_max] for r in known.racks]
     (tmp_path / "hall.toml").write_text(f"width_m = 12.0\ndepth_m = 10.0\nracks = {racks}\n")
@@ -194,7 +194,7 @@ def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> N
         read_floor(tmp_path / "hall.toml")
 
 
-def test_what_does_not_fit_a_floor_is_refused_first(tmp_path, capsys, shell):
+def test_conditions_that_do_not_fit_the_floor_are_rejected(tmp_path, capsys, shell):
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
     message = "has no room for episodes of blocked_aisle"
@@ -220,7 +220,7 @@ def test_what_does_not_fit_a_floor_is_refused_first(tmp_path, capsys, shell):
     assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
 
 
-def test_one_way_rules_turn_the_plan_but_shut_nobody_in() -> None:
+def test_one_way_rules_reroute_without_trapping() -> None:
     floor = default_warehouse()
     lane = floor.segments[2].area  # aisle 2, west
     start, goal = (lane.x_max - 0.5, lane.center[1]), (lane.x_min - 1.0, lane.center[1])
@@ -244,7 +244,7 @@ def test_one_way_rules_turn_the_plan_but_shut_nobody_in() -> None:
     assert seen[:, 0].min() < lane.x_min
 
 
-def test_a_block_in_an_aisle_that_runs_north_is_found() -> None:
+def test_block_in_north_south_aisle_is_found() -> None:
     floor = generate(3)
     area = floor.segments[1].area
     assert floor.segments[1].along == "y"
@@ -273,7 +273,7 @@ def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.
 
 
 @pytest.mark.long
-def test_an_episode_is_the_same_among_other_floors() -> None:
+def test_episode_does_not_depend_on_other_floors() -> None:
     floors = open_floors("default,generated:train:3,narrow:1")
     # What comes after a bump is drawn among the floors that are there.
     task = msgspec.structs.replace(load_profile("warehouse_amr").task, bump_terminates=False)
@@ -297,7 +297,7 @@ def replace_layout(spec: EpisodeSpec, layout: str) -> EpisodeSpec:
     return EpisodeSpec(spec.condition, spec.seed, layout=layout)
 
 
-def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:
+def test_episodes_use_all_floors_and_info_names_them() -> None:
     env = WarehouseVectorEnv(64, layouts="generated:train:4", conditions={"nominal": 1.0})
     _, info = env.reset(seed=1)
     assert set(info["layout"]) == {floor.name for floor in env.floors}
@@ -308,7 +308,7 @@ def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:
         _drive(env, [EpisodeSpec("nominal", 1, layout="default")] * 64, 0)
 
 
-def test_the_profile_names_the_same_zones_as_the_warehouse() -> None:
+def test_profile_and_warehouse_zones_match() -> None:
     zones = {zone.name: zone.box_m for zone in load_profile("warehouse_amr").zones}
     built = default_warehouse().zones
     assert zones.keys() == built.keys()
@@ -317,7 +317,7 @@ def test_the_profile_names_the_same_zones_as_the_warehouse() -> None:
         np.testing.assert_allclose(zones[name], edges, atol=1e-9, err_msg=name)
 
 
-def test_racks_fill_exactly_what_aisles_and_cross_aisles_leave() -> None:
+def test_racks_fill_space_outside_aisles() -> None:
     floor = default_warehouse()
     rng = np.random.default_rng(1)
     for x, y in rng.uniform((0, 0), (floor.width_m, floor.depth_m), (400, 2)):
@@ -327,7 +327,7 @@ def test_racks_fill_exactly_what_aisles_and_cross_aisles_leave() -> None:
         assert in_rack == (not in_aisle and not in_cross)
 
 
-def test_a_point_belongs_to_its_aisle_segment() -> None:
+def test_point_belongs_to_its_aisle_segment() -> None:
     floor = default_warehouse()
     middles = np.array([segment.area.center for segment in floor.segments])
     segment = floor.segment_of(middles[:, 0], middles[:, 1])

@@ -88,7 +88,7 @@ def position(gap: TwinGap, condition: str, source: str, horizon_s: float) -> dic
 
 
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
-def test_the_true_parameters_close_the_gap(gap, horizon_s):
+def test_true_parameters_reduce_the_gap(gap, horizon_s):
     before, after = (
         position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER)
     )
@@ -97,7 +97,7 @@ def test_the_true_parameters_close_the_gap(gap, horizon_s):
     assert after < odometry  # whose wheels are not as large as it takes them to be
 
 
-def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
+def test_slippery_floor_is_untrusted(gap: TwinGap) -> None:
     said = {found.condition: found for found in gap.verdicts}
     assert said["wheel_slip"].verdict == UNTRUSTED
     assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
@@ -108,7 +108,7 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
     assert any("patches" in line for line in gap.not_done)
 
 
-def test_one_step_gaps_fall_with_the_true_parameters(gap: TwinGap) -> None:
+def test_true_parameters_reduce_one_step_gaps(gap: TwinGap) -> None:
     def of(component: str, source: str) -> float:
         return next(
             float(row["mean_gap"])
@@ -128,7 +128,7 @@ def test_one_step_gaps_fall_with_the_true_parameters(gap: TwinGap) -> None:
     assert whole[AFTER] < whole[BEFORE]
 
 
-def test_the_lidar_is_compared_where_the_floor_is_the_twins(gap: TwinGap, stored: Path) -> None:
+def test_lidar_is_compared_on_matching_floor(gap: TwinGap, stored: Path) -> None:
     sectors = [row for row in gap.observations if row["component"].startswith("clearance_")]
     assert sectors
     with Store(stored) as store:
@@ -138,7 +138,7 @@ def test_the_lidar_is_compared_where_the_floor_is_the_twins(gap: TwinGap, stored
         assert agreement(steps, store, rows, empty_floor()) > 2 * AGREES
 
 
-def test_what_is_rebuilt_from_a_store_is_what_was_logged(stored: Path) -> None:
+def test_rebuilt_steps_match_the_log(stored: Path) -> None:
     with Store(stored) as store:
         steps = logged_steps(store)
         seen, after = observations(store, steps.transition_id, steps.task.observation_size)
@@ -166,7 +166,7 @@ def test_what_is_rebuilt_from_a_store_is_what_was_logged(stored: Path) -> None:
     np.testing.assert_allclose(plans.progress_m(steps, rows, steps.after), steps.progress_m)
 
 
-def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
+def test_logged_reward_is_sum_of_terms(stored: Path) -> None:
     with Store(stored) as store:
         steps = logged_steps(store)
         rows = np.arange(0, len(steps), 5)
@@ -184,7 +184,7 @@ def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
     np.testing.assert_allclose(sum(found.logged.terms.values()), found.logged.reward, atol=1e-3)
 
 
-def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Path) -> None:
+def test_gap_round_trips_and_renders(gap: TwinGap, tmp_path: Path) -> None:
     write_gap(gap, tmp_path / "gap")
     again = read_gap(tmp_path / "gap")
     assert again.verdicts == gap.verdicts
@@ -206,7 +206,7 @@ def run(*args: object) -> int:
     return cli.main(["twin", "gap", *map(str, args)])
 
 
-def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gap_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     few = ("--horizon-s", "3")
     (tmp_path / "true.toml").write_text('name = "true"\nwheel_radius_scale = 0.96\n')
     given = (stored, *few, "--perturbation", tmp_path / "true.toml", "--out", tmp_path / "gap")
@@ -220,7 +220,7 @@ def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason=f"{TURTLEBOT.name} is not here")
-def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
+def test_turtlebot3_gap_is_unknown(tmp_path: Path) -> None:
     ingest(TURTLEBOT, load_profile("turtlebot3"), store=StoreWriter(tmp_path))
     with Store(tmp_path) as store:
         gap = measure_gap(store)
@@ -253,7 +253,7 @@ FINE, WORSE = ConfidenceInterval(0.3, 0.2, 0.4), ConfidenceInterval(1.5, 1.2, 1.
         (BAD, WORSE, 19, UNKNOWN),
     ],
 )
-def test_the_rule(position_p90, reward, segments, verdict):
+def test_trust_verdict_rule(position_p90, reward, segments, verdict):
     found = trust_verdict(
         "wheel_slip",
         limits=TrustLimits(),

@@ -52,7 +52,7 @@ def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.nd
         st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(-7, 7)), min_size=8, max_size=8
     ),
 )
-def test_compiled_ranges_are_those_of_mujoco(which, places, environments):
+def test_compiled_ranges_match_mujoco(which, places, environments):
     env = environments[which]
     for index, (x, y, yaw) in enumerate(places):
         floor = env.floor_of(index)
@@ -64,7 +64,7 @@ def test_compiled_ranges_are_those_of_mujoco(which, places, environments):
 
 
 @needs_native
-def test_people_pallets_and_forklifts_are_seen(environments, monkeypatch):
+def test_lidar_sees_people_pallets_and_forklifts(environments, monkeypatch):
     simulation, floor = environments[0].simulation, environments[0].floor_of(0)
     moving = simulation.scenery
     x, y = floor.goals[0]
@@ -82,7 +82,7 @@ def test_people_pallets_and_forklifts_are_seen(environments, monkeypatch):
 
 
 @needs_native
-def test_what_does_not_fit_is_refused() -> None:
+def test_arrays_of_wrong_shape_or_dtype_are_rejected() -> None:
     place, one, two = np.zeros(2), np.zeros(1), np.zeros(2, np.int64)
     first = np.zeros(1, np.int64)
     arguments = [place, one, place, one, first, first, two, np.zeros(0), np.zeros(6), one.copy()]
@@ -126,7 +126,7 @@ def test_people_and_forklifts_stand_on_the_floor() -> None:
 @pytest.mark.parametrize(
     "lidar", [LidarLimits(angle_min_rad=-1.6, angle_max_rad=1.6), LidarLimits(z_m=1.0)]
 )
-def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) -> None:
+def test_true_clearance_covers_lidar_blind_spot(lidar: LidarLimits) -> None:
     env = WarehouseVectorEnv(1, robot=Robot(lidar=lidar), conditions={"blocked_aisle": 1.0})
     env.reset(seed=2)
     x, y, yaw = env.simulation.pallets[0, 0]
@@ -139,7 +139,7 @@ def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) 
     assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind
 
 
-def test_the_lidars_place_and_what_lies_outside_is_shown(tmp_path, shell):
+def test_robot_command_shows_lidar_and_warnings(tmp_path, shell):
     robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"
     text = WAREHOUSE.replace("lidar_x_m = 0.0", "lidar_x_m = -0.5") + robot
     (tmp_path / "amr.toml").write_text(text)

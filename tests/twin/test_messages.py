@@ -28,7 +28,7 @@ STAMP_NS = 1_760_000_000_123_456_789
     ranges=st.lists(st.floats(width=32, allow_nan=False), max_size=5),
 )
 @settings(max_examples=60)
-def test_any_shape_packs_as_rosbags_serialises_it(frame, names, ranges):
+def test_packed_messages_match_rosbags(frame, names, ranges):
     """Check alignment after strings and sequences of any length, empty ones too."""
     numbers = np.arange(len(names), dtype=float)
     for shape, columns in [
@@ -58,7 +58,7 @@ def test_any_shape_packs_as_rosbags_serialises_it(frame, names, ranges):
         assert serialise(again) == layout.exemplar
 
 
-def test_one_path_fills_every_item_of_a_sequence() -> None:
+def test_plan_fills_every_pose_of_the_path() -> None:
     points = np.array([[0.0, 1.0], [2.0, 3.0], [2.0, 4.0]])
     path = typestore().deserialize_cdr(plan(STAMP_NS, points), "nav_msgs/msg/Path")
     assert [[p.pose.position.x, p.pose.position.y] for p in path.poses] == points.tolist()
@@ -69,7 +69,7 @@ def test_one_path_fills_every_item_of_a_sequence() -> None:
 
 
 @pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])
-def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, file_format: Format) -> None:
+def test_interrupted_recording_leaves_no_files(tmp_path: Path, file_format: Format) -> None:
     topics = [Topic("/pressed", "std_msgs/msg/Bool")]
 
     def interrupted() -> None:

@@ -44,7 +44,7 @@ assert [arm.name for arm in env.mission_arms()] == [kind]
 """
 
 
-def test_a_kind_of_mission_is_one_file(tmp_path: Path) -> None:
+def test_new_mission_kind_needs_one_file(tmp_path: Path) -> None:
     kinds = shutil.copytree(ROOT / "train/twin/missions", tmp_path / "missions")
     (kinds / "bystander.py").write_text(KIND)
     done = subprocess.run(  # a process of its own: the registry is read once

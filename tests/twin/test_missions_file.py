@@ -37,7 +37,7 @@ def ordered(*given: MissionOrder, seed: int = 0) -> OrderedMissions:
     return OrderedMissions(orders(*given), file, seed, "handover", Perturbation())
 
 
-def test_a_mission_of_a_zone_comes_through_it() -> None:
+def test_mission_of_a_zone_passes_through_it() -> None:
     made = orders(SLIP, THERE)
     specs = [made.spec(1, seed) for seed in range(6)]
     assert len(set(specs)) == 6
@@ -60,13 +60,13 @@ def test_a_mission_of_a_zone_comes_through_it() -> None:
         (MissionOrder(kind="nominal", missions=1, layout="hall"), "floor 'hall'"),
     ],
 )
-def test_what_the_twin_cannot_hold_is_refused_by_name(order: MissionOrder, message: str) -> None:
+def test_orders_the_twin_lacks_are_rejected_by_name(order: MissionOrder, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
         orders(SLIP, order)
     assert "missions[1]" in str(error.value)
 
 
-def test_rounds_drive_on_until_enough_met_their_kind() -> None:
+def test_rounds_continue_until_enough_missions_count() -> None:
     missions = ordered(SLIP, MissionOrder(kind="near_collision", missions=2))
     driven = []
     for one_round in missions.rounds():
@@ -81,7 +81,7 @@ def test_rounds_drive_on_until_enough_met_their_kind() -> None:
     assert not missions.owed()
 
 
-def test_missions_of_a_robot_are_those_of_its_tag() -> None:
+def test_robot_tag_selects_missions() -> None:
     file = MissionsFile(missions=(SLIP, MissionOrder(kind="nominal", missions=1, robot="amr_7")))
     with pytest.raises(ConfigError, match="amr_7: no robot was given"):
         RecordingPlan(missions=file).orders()
@@ -92,7 +92,7 @@ def test_missions_of_a_robot_are_those_of_its_tag() -> None:
     assert RecordingPlan(missions=file, tags={"robot": "amr_8"}).orders() == [SLIP]
 
 
-def test_a_dry_run_or_a_wrong_file_writes_nothing(tmp_path, shell):
+def test_dry_run_and_invalid_file_write_nothing(tmp_path, shell):
     out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\n')
     args = ["twin", "record", "--out", str(out), "--missions", str(file)]
@@ -107,7 +107,7 @@ def test_a_dry_run_or_a_wrong_file_writes_nothing(tmp_path, shell):
     assert not out.exists()
 
 
-def test_missions_are_counted_by_what_they_met(tmp_path, shell):
+def test_record_counts_missions_by_observed_condition(tmp_path, shell):
     file = tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "nominal"\nmissions = 1\n')
     out = tmp_path / "next.mcap"
@@ -117,7 +117,7 @@ def test_missions_are_counted_by_what_they_met(tmp_path, shell):
 
 
 @pytest.mark.slow
-def test_a_list_that_is_driven_and_ingested_closes_its_gaps(tmp_path, shell):
+def test_recorded_missions_close_coverage_gaps(tmp_path, shell):
     """Drive what is missing and measure again: gaps are closed, or within their intervals."""
 
     run = shell.json
@@ -154,7 +154,7 @@ def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) ->
     return [queue.next(1)[0] for _ in range(count)]
 
 
-def test_a_share_of_trainings_episodes_follows_the_file() -> None:
+def test_missions_share_sets_share_of_episodes() -> None:
     missions = (SLIP, MissionOrder(kind="blocked_aisle", missions=12))
     plain, mixed = drawn((), 0.5), drawn(missions, 0.5)
     kinds = Counter(spec.condition for spec in mixed)
@@ -165,7 +165,7 @@ def test_a_share_of_trainings_episodes_follows_the_file() -> None:
     assert all(spec.condition != "nominal" for spec in drawn(missions, 1.0))
 
 
-def test_a_run_keeps_its_missions_and_comparisons_see_them(tmp_path: Path) -> None:
+def test_run_config_keeps_missions_as_practice(tmp_path: Path) -> None:
     file = tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "cross_east"\n')
     settings = [f"env.missions={str(file)!r}", "env.missions_share=0.25"]

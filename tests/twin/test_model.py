@@ -82,7 +82,9 @@ def mass(sim: Simulation) -> float:
     ("friction", "rise", "seconds"),
     [(0.1, 0.0, 3.0), (0.2, 0.0, 3.0), (0.3, 0.0, 3.0), (0.2, 0.05, 0.4), (0.2, -0.05, 0.4)],
 )
-def test_a_stop_takes_what_coulomb_says(friction: float, rise: float, seconds: float) -> None:
+def test_braking_distance_matches_coulomb_friction(
+    friction: float, rise: float, seconds: float
+) -> None:
     # Wheels locked from 1 m/s: v^2 / (2 g (mu share cos + sin)), with the share of the weight that
     # brakes; uphill with a positive sine.
     sim = simulation(0.01)
@@ -103,7 +105,7 @@ def test_a_stop_takes_what_coulomb_says(friction: float, rise: float, seconds: f
 
 
 @pytest.mark.parametrize("friction", [0.03, 0.06, 0.1])
-def test_acceleration_is_what_friction_gives(friction: float) -> None:
+def test_acceleration_matches_friction(friction: float) -> None:
     sim = simulation(0.01)
     scale = friction / 0.8
     floor = Perturbation(friction_scale=max(scale, 0.05), **QUIET)
@@ -117,7 +119,7 @@ def test_acceleration_is_what_friction_gives(friction: float) -> None:
 
 
 @pytest.mark.parametrize("friction", [0.05, 0.1, 0.2])
-def test_slip_in_the_first_second_is_what_coulomb_leaves(friction: float) -> None:
+def test_starting_slip_matches_coulomb_friction(friction: float) -> None:
     # The wheels follow the ramp of 4 m/s2 to 1 m/s: 1 - 1 / 8 m in a second. The floor gives
     # a = mu g share: the robot comes a / 2 m far, or 1 - 1 / (2 a) where it reaches 1 m/s.
     sim = simulation(0.01)
@@ -131,7 +133,7 @@ def test_slip_in_the_first_second_is_what_coulomb_leaves(friction: float) -> Non
     assert 1 - (sim.pose()[0, 1] - 1.0) / rolled == pytest.approx(expected, rel=0.15)
 
 
-def test_yaw_under_split_friction_is_what_the_two_forces_turn() -> None:
+def test_yaw_acceleration_matches_split_friction() -> None:
     # Both wheels spin: mu N / 2 each, on arms of half a track, turn the robot about its centre.
     floor, left = 0.1, 0.5
     sim = simulation(0.01)
@@ -149,7 +151,7 @@ def test_yaw_under_split_friction_is_what_the_two_forces_turn() -> None:
     assert (sim.qvel[0, 5] - before) / 0.2 == pytest.approx(torque / inertia[5, 5], rel=0.15)
 
 
-def test_a_blocked_aisle_stops_the_robot_at_the_pallets_face() -> None:
+def test_robot_stops_at_pallet_face() -> None:
     pallets = no_pallets()
     pallets[0] = (4.0, 3.2, 0.0)
     pallets[1] = (4.0, 4.05, 0.0)
@@ -162,7 +164,7 @@ def test_a_blocked_aisle_stops_the_robot_at_the_pallets_face() -> None:
 
 
 @pytest.mark.parametrize("payload", [0.0, 60.0, 120.0])
-def test_speed_while_starting_is_what_the_motors_give_the_mass(payload: float) -> None:
+def test_starting_speed_matches_motors_and_mass(payload: float) -> None:
     # Two motors of torque kv (commanded - actual), 18 Nm at most, move the mass and the wheels' own
     # inertia: integrated by hand at .1 ms, on a floor that grips.
     sim = simulation(0.005)
@@ -178,7 +180,7 @@ def test_speed_while_starting_is_what_the_motors_give_the_mass(payload: float) -
     assert sim.qvel[0, 1] == pytest.approx(speed, rel=0.15)
 
 
-def test_a_smaller_wheel_drives_shorter_by_its_scale() -> None:
+def test_distance_scales_with_wheel_radius() -> None:
     way = []
     for scale in (1.0, 0.95):
         sim = simulation(0.01)
@@ -188,7 +190,7 @@ def test_a_smaller_wheel_drives_shorter_by_its_scale() -> None:
     assert way[1] / way[0] == pytest.approx(0.95, abs=0.01)
 
 
-def test_a_wider_track_turns_slower_by_its_scale() -> None:
+def test_turn_rate_scales_with_track() -> None:
     turned = []
     for scale in (1.0, 1.08):
         sim = simulation(0.01)
@@ -200,7 +202,7 @@ def test_a_wider_track_turns_slower_by_its_scale() -> None:
     assert turned[0] / turned[1] == pytest.approx(1.08, abs=0.02)
 
 
-def test_latency_delays_the_wheels_by_what_it_says() -> None:
+def test_latency_delays_wheel_commands() -> None:
     sim = simulation(0.01)
     for latency, still in ((0.0, 0), (0.13, 13), (0.3, 30)):
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(latency_s=latency))
@@ -212,7 +214,7 @@ def test_latency_delays_the_wheels_by_what_it_says() -> None:
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2])
-def test_the_longest_latency_holds_at_every_control_period(period_s: float) -> None:
+def test_max_latency_holds_at_every_control_period(period_s: float) -> None:
     robot, longest = stand_in(load_profile("warehouse_amr").task.body), RANGES["latency_s"][1]
     substeps = round(min(period_s, BLOCK_S) / 0.01)
     controller = base_controller(1, robot, period_s, 0.01, substeps)
@@ -227,7 +229,7 @@ def test_the_longest_latency_holds_at_every_control_period(period_s: float) -> N
 
 
 @pytest.mark.parametrize("friction", [0.8, 0.1, 0.03])
-def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
+def test_slalom_converges_with_timestep(friction: float) -> None:
     ends = {}
     for timestep in (0.01, 0.005, 0.001):
         sim = simulation(timestep)
@@ -242,7 +244,7 @@ def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
     assert gap[0.005] < gap[0.01]
 
 
-def test_the_slipperiest_patch_of_a_place_counts() -> None:
+def test_overlapping_patches_use_lowest_friction() -> None:
     patches = np.array([[[1.0, 1.0, 0.5, 0.5, 0.1], [1.2, 1.0, 0.5, 0.5, 0.05]]])
     points = np.array([[[0.6, 1.0], [1.0, 1.0], [3.0, 3.0]]])
     np.testing.assert_allclose(friction_at(points, patches, np.array([0.8])), [[0.1, 0.05, 0.8]])

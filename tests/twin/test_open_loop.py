@@ -63,7 +63,7 @@ def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> OpenLoopStart:
     return OpenLoopStart(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))
 
 
-def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None:
+def test_fit_and_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None:
     cut = log_segments(steps, 1.2)
     rows = cut.row[:, None] + np.arange(cut.horizon_steps)
     with Store(store) as opened:
@@ -88,7 +88,7 @@ def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps)
 
 
 @pytest.mark.parametrize("mapped", one_in(2, [True, False]))
-def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
+def test_single_step_equals_start_of_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
     rows = log_segments(steps, 1.2).row[::3]
     warehouse = default_warehouse() if mapped else None
     one, many = (

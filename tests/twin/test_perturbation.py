@@ -30,7 +30,7 @@ from restock.train.twin.physics.simulation import Simulation
 PAGE = ROOT / "docs" / "twin.md"
 
 
-def test_every_field_has_a_range_and_a_line_in_the_docs() -> None:
+def test_every_field_has_a_documented_range() -> None:
     fields = {field.name: field.default for field in msgspec.structs.fields(Perturbation)}
     assert fields.keys() - {"name"} == RANGES.keys()
     page = PAGE.read_text(encoding="utf-8")
@@ -41,7 +41,7 @@ def test_every_field_has_a_range_and_a_line_in_the_docs() -> None:
         assert cells[2:4] == [f"{low:g} to {high:g}", f"{fields[name]:g}"]
 
 
-def test_a_perturbation_is_a_name_a_file_or_a_table(tmp_path: Path) -> None:
+def test_perturbation_from_name_file_or_table(tmp_path: Path) -> None:
     file = tmp_path / "wet.toml"
     file.write_text('name = "wet"\nfriction_scale = 0.5\n')
     wet = Perturbation(name="wet", friction_scale=0.5)
@@ -73,13 +73,13 @@ def drive(steps: int = 6, **changed: float) -> list[dict[str, np.ndarray]]:
     return seen
 
 
-def test_a_slow_lidar_shows_the_scan_before() -> None:
+def test_slow_lidar_repeats_previous_scan() -> None:
     scans = [signals["sector_clearance_m"] for signals in drive(lidar_period_s=0.4)]
     fresh = [not np.array_equal(*pair) for pair in pairwise(scans)]
     assert fresh == [False, True] * 3
 
 
-def test_a_slow_localisation_keeps_its_pose_and_the_stamp_of_it() -> None:
+def test_slow_localisation_keeps_pose_and_stamp() -> None:
     seen = drive(localisation_period_s=0.6)
     age_s = [(s["stamp_ns"] - s["pose_stamp_ns"])[0] * 1e-9 for s in seen]
     np.testing.assert_allclose(age_s, [0, 0.2, 0.4, 0, 0.2, 0.4, 0], atol=1e-9)
@@ -97,14 +97,14 @@ def test_a_slow_localisation_keeps_its_pose_and_the_stamp_of_it() -> None:
         ("accel_bias_mps2", 0.3, "accel_x_mps2", 0.3),
     ],
 )
-def test_a_bias_moves_its_signal_and_no_other(field, bias, signal, shift):
+def test_bias_shifts_only_its_signal(field, bias, signal, shift):
     plain, biased = drive(2)[-1], drive(2, **{field: bias})[-1]
     assert (biased[signal] - plain[signal])[0] == pytest.approx(shift)
     for other in ("pose_x_m", "clearance_m", "gyro_yaw_rate_radps", "accel_x_mps2"):
         assert other == signal or biased[other] == plain[other]
 
 
-def test_localisation_drifts_as_an_autoregressive_walk() -> None:
+def test_localisation_drift_is_autoregressive() -> None:
     task = load_profile("warehouse_amr").task
     sensing = Sensing(Simulation(4, task, default_warehouse(), 0.01, nthread=1), task)
     keep = np.exp(-task.control_period_s / DRIFT_TIME_S)
@@ -131,7 +131,7 @@ def test_localisation_drifts_as_an_autoregressive_walk() -> None:
     ],
     ids=lambda text: text[:40],
 )
-def test_what_is_no_perturbation_is_not_known_and_said(text: str) -> None:
+def test_invalid_perturbation_is_unknown_and_noted(text: str) -> None:
     assert parse_perturbation(text) is None
     perturbed = Perturbed.read(
         [text, '{"name": "wet", "values": {"gain": 0.9}}'], np.array([0, 1, -1])
@@ -142,7 +142,7 @@ def test_what_is_no_perturbation_is_not_known_and_said(text: str) -> None:
     assert len(perturbed.notes) == 1
 
 
-def test_a_recording_holds_what_was_said_from_then_on() -> None:
+def test_perturbation_message_applies_from_its_time() -> None:
     profile, topics = load_profile("warehouse_amr"), Drive(duration_s=4.0).topics()
     texts = [
         json.dumps({"name": "wet", "values": {"friction_scale": 0.5}}),

@@ -32,11 +32,11 @@ def drive() -> Drive:
     return drive_of(TASK, np.array(poses), np.array(clearances))
 
 
-def test_it_is_on_its_own_floor(drive: Drive) -> None:
+def test_drive_matches_its_own_floor(drive: Drive) -> None:
     assert placed_on(FLOOR, drive)
 
 
-def test_walls_that_are_elsewhere_tell_another_floor(drive: Drive) -> None:
+def test_other_walls_rule_a_floor_out(drive: Drive) -> None:
     hall = replace(FLOOR, racks=())  # open ground: all of its poses fit
     assert on_free_ground(hall, drive.places_m).all()
     assert not placed_on(hall, drive)
@@ -44,7 +44,7 @@ def test_walls_that_are_elsewhere_tell_another_floor(drive: Drive) -> None:
     assert not placed_on(OTHER, drive)
 
 
-def test_a_frame_that_is_off_or_turned_is_another(drive: Drive) -> None:
+def test_shifted_or_rotated_frame_rules_a_floor_out(drive: Drive) -> None:
     x, y, yaw = FLOOR.map_origin
     assert not placed_on(replace(FLOOR, map_origin=(x + 1.5, y, yaw)), drive)
     assert not placed_on(replace(FLOOR, map_origin=(x, y, yaw + 0.4)), drive)

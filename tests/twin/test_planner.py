@@ -14,7 +14,7 @@ FLOOR = default_warehouse()
 PLANNER = Planner(FLOOR)
 
 
-def test_plans_keep_clear_of_racks_and_end_at_the_goal() -> None:
+def test_plans_avoid_racks_and_end_at_goal() -> None:
     rng = np.random.default_rng(3)
     for goal in FLOOR.goals[rng.integers(len(FLOOR.goals), size=20)]:
         area = FLOOR.segments[rng.integers(len(FLOOR.segments))].area
@@ -26,14 +26,14 @@ def test_plans_keep_clear_of_racks_and_end_at_the_goal() -> None:
             assert not any(rack.contains(x, y, -0.25) for rack in FLOOR.racks)
 
 
-def test_a_plan_is_not_much_longer_than_the_way_must_be() -> None:
+def test_plan_length_is_near_shortest() -> None:
     # Aisle 1 west to aisle 3 east through the middle cross-aisle: 2.95 + 5.47 + 2.55 by right
     # angles; cutting corners may save some of it, nothing may add to it.
     plan = PLANNER.plan(3.0, 0.9, (8.5, 6.37))
     assert np.hypot(5.5, 5.47) < length_m(plan) < 5.5 + 5.47
 
 
-def test_a_closed_aisle_is_gone_around() -> None:
+def test_plan_avoids_closed_aisle() -> None:
     start, goal = (3.0, 0.9), (8.45, 0.9)
     straight = PLANNER.plan(*start, goal)
     around = PLANNER.plan(*start, goal, [(1, 1)])  # aisle 1 east, .3 to .6 m into it
@@ -43,14 +43,14 @@ def test_a_closed_aisle_is_gone_around() -> None:
     assert not near.any()
 
 
-def test_if_all_ways_seem_closed_the_latest_is_opened_again() -> None:
+def test_latest_closure_reopens_if_goal_is_unreachable() -> None:
     # Both ends of the goal's aisle segment: there is no way in.
     plan = PLANNER.plan(3.0, 3.6, (8.45, 0.9), [(1, 0), (1, 8)])
     np.testing.assert_allclose(plan[-1], (8.45, 0.9))
 
 
 @pytest.mark.parametrize("block", ["partial", "full"])
-def test_the_lidar_finds_full_blocks_and_passes_partial_ones(block: str) -> None:
+def test_lidar_finds_only_full_blocks(block: str) -> None:
     specs = [EpisodeSpec("blocked_aisle", seed) for seed in range(60)]
     specs = [s for s in specs if draw_episode(s, FLOOR, PLANNER).block == block][:12]
     blocked = 0
@@ -77,7 +77,7 @@ class _Straight:
         return np.where(stop, 0, action)
 
 
-def test_a_person_in_the_aisle_is_no_block() -> None:
+def test_person_is_not_a_block() -> None:
     finder = BlockFinder([FLOOR], 1)
     area = FLOOR.segments[0].area
     pose = np.array([[area.x_min, area.center[1], 0.0]])

@@ -45,7 +45,7 @@ def success(
 
 
 @pytest.mark.long
-def test_the_planner_is_stuck_in_partly_blocked_aisles() -> None:
+def test_planner_is_stuck_in_partly_blocked_aisles() -> None:
     assert success(PlannerFollower(), "nominal")["none"] >= 0.95
     blocked = success(PlannerFollower(), "blocked_aisle")
     assert blocked["partial"] <= 0.3
@@ -56,14 +56,14 @@ KINDS = ["near_collision", "wheel_slip", "blocked_aisle", "nominal"]
 
 
 @pytest.mark.parametrize("kind", one_in(2, KINDS))
-def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
+def test_operator_mostly_succeeds_in_every_condition(kind: str) -> None:
     # 24 episodes: 4 to 10 points of noise below what benchmarks/drivers.py asks over 100.
     assert min(success(Operator(), kind).values()) >= 0.8
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("layouts", ["default", "generated:test"])
-def test_the_operator_gets_past_pallets(layouts: str) -> None:
+def test_operator_gets_past_pallets(layouts: str) -> None:
     """Drive through the gap if there is one, else around, on floors of any kind."""
     passed = success(Operator(epsilon=0.0), "blocked_aisle", layouts=layouts)
     assert min(passed.values()) >= 0.9
@@ -82,21 +82,21 @@ class Watched(Handover):
 
 
 @pytest.mark.long
-def test_the_operator_takes_over_and_hands_back() -> None:
+def test_operator_takes_over_and_hands_back() -> None:
     policy = Watched()
     assert success(policy, "blocked_aisle")["partial"] >= 0.5
     assert policy.passed[True] >= 8
     assert policy.passed[False] >= 5
 
 
-def test_nobody_hands_over_in_nominal_aisles() -> None:
+def test_nominal_aisles_need_no_handover() -> None:
     policy = Watched()
     success(policy, "nominal", count=12)
     assert policy.passed.total() <= 2
 
 
 @pytest.mark.parametrize("make", [PlannerFollower, Operator, RandomPolicy])
-def test_stated_probabilities_match_what_is_done(make: type[PlannerFollower]) -> None:
+def test_reported_probabilities_match_actions(make: type[PlannerFollower]) -> None:
     env = WarehouseVectorEnv(64)
     env.reset(seed=1)
     policy = make(seed=3)
@@ -113,7 +113,7 @@ def test_stated_probabilities_match_what_is_done(make: type[PlannerFollower]) ->
         assert (policy.acting == policy.name).all()
 
 
-def test_a_lattice_guides_an_operator_that_was_stuck() -> None:
+def test_lattice_guides_stuck_operator() -> None:
     """Get a real Neato's outline through passages of .5 m, which it was stuck before."""
     env = WarehouseVectorEnv(4, conditions={"nominal": 1.0})
     first = Operator(seed=6)
@@ -136,7 +136,7 @@ def test_a_lattice_guides_an_operator_that_was_stuck() -> None:
     assert np.isnan(first._stuck_m).all()
 
 
-def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
+def test_slow_moving_robot_is_not_stuck() -> None:
     """Drive at .28 m/s, less than .1 m in the steps after which a robot counts as stuck."""
     task = load_profile("warehouse_amr").task
     slow = tuple((0.28 * v, w) for v, w in task.actions)
@@ -174,7 +174,7 @@ def small_slow_robot() -> Task:
     )
 
 
-def test_a_small_robot_drives_through_a_gap_wide_for_it() -> None:
+def test_small_robot_drives_through_narrow_gap() -> None:
     """Drive on: it once turned left and right before gaps too narrow for the stand-in."""
     gap = Rect(1.5, 0.0, 2.5, 0.8), Rect(1.5, 1.2, 2.5, 2.0)
     ends = (3.4, 1.0), (0.6, 1.0)

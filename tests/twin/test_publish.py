@@ -94,7 +94,7 @@ def _stamps(rows: list[tuple[int, object]]) -> NDArray[np.int64]:
     return np.array([v.header.stamp.sec * 10**9 + v.header.stamp.nanosec for _, v in rows])
 
 
-def test_every_topic_has_its_rate(messages: list[Message]) -> None:
+def test_topics_have_their_rates(messages: list[Message]) -> None:
     counts = {topic: len(rows) for topic, rows in _decoded(messages).items()}
     assert counts == {
         "/goal_pose": 1,
@@ -118,7 +118,7 @@ def test_every_topic_has_its_rate(messages: list[Message]) -> None:
     }
 
 
-def test_a_message_is_measured_then_sent_then_received(messages: list[Message]) -> None:
+def test_stamp_precedes_publish_and_log_time(messages: list[Message]) -> None:
     assert all(m.publish_ns < m.log_ns for m in messages)
     assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
     for topic, rows in _decoded(messages).items():
@@ -129,14 +129,14 @@ def test_a_message_is_measured_then_sent_then_received(messages: list[Message]) 
             assert topic == "/goal_pose" or len(set(delay.tolist())) > 1, topic
 
 
-def test_a_replaced_plan_is_not_sent_again_at_that_tick(drive: Drive) -> None:
+def test_replaced_plan_is_not_repeated(drive: Drive) -> None:
     # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
     changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
     plans = _decoded(_robot().publish(changed, START_NS))["/plan"]
     assert [len(value.poses) for _, value in plans] == [5, 7, 7]
 
 
-def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(drive, messages):
+def test_odometry_and_tf_match_the_drive(drive, messages):
     by_topic = _decoded(messages)
     last = by_topic["/odom"][-1][1].pose.pose.position
     assert (last.x, last.y) == pytest.approx(drive.motion.pose[-1, :2], abs=5e-3)

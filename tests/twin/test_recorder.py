@@ -34,7 +34,7 @@ from restock.train.twin.recording.recorder import (
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "file_format"), [("a.mcap", "mcap"), ("a", "rosbag2")])
-def test_a_recording_says_whose_it_is_and_when(tmp_path, name, file_format):
+def test_recording_keeps_tags_and_start_time(tmp_path, name, file_format):
     """As ingest reads it; what was driven is in both formats by tests/ingest/test_round_trip.py."""
     tags, start_ns = {"robot": "amr-07", "line": "007"}, parse_start("2026-10-05T10:00+02:00")
     plan = RecordingPlan(format=file_format, missions=1, seed=3, tags=tags, start_ns=start_ns)
@@ -46,7 +46,7 @@ def test_a_recording_says_whose_it_is_and_when(tmp_path, name, file_format):
 
 
 @pytest.mark.parametrize("name", one_in(2, ["a.mcap", "a"]))
-def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
+def test_same_seed_gives_identical_files(tmp_path: Path, name: str) -> None:
     args = ["twin", "record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
     for folder in ("first", "second"):
         assert cli.main([*args, "--out", str(tmp_path / folder / name)]) == ExitCode.OK
@@ -63,7 +63,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     assert first != third
 
 
-def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_record_prints_json_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bag"
     code = cli.main(
         ["twin", "record", "--out", str(out), "--minutes", "0.01", "--policy", "random", "--json"]
@@ -90,7 +90,7 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--out", "drive.txt"], "ends in .mcap"),
     ],
 )
-def test_a_wrong_value_is_one_clear_message(flags, message, tmp_path, capsys):
+def test_invalid_record_option_is_rejected(flags, message, tmp_path, capsys):
     code = cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap"), *flags])
     captured = capsys.readouterr()
     assert code == ExitCode.USAGE
@@ -99,19 +99,19 @@ def test_a_wrong_value_is_one_clear_message(flags, message, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dated_name_is_a_folders(tmp_path: Path) -> None:
+def test_dated_name_is_a_folder(tmp_path: Path) -> None:
     dated = str(tmp_path / "drive.2026-10-05")
     assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
-def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+def test_recording_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "log.mcap").write_text("precious")
     assert cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
     assert (tmp_path / "log.mcap").read_text() == "precious"
 
 
 @pytest.mark.long
-def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_no_files(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "restock", "twin", "record", "--minutes", "600", "--out"]
     process = subprocess.Popen([*command, str(tmp_path / "log.mcap")], stderr=subprocess.PIPE)
     deadline = time.monotonic() + 240
@@ -125,7 +125,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missions_come_at_their_shares_and_rare_ones_come_early() -> None:
+def test_mission_schedule_meets_shares() -> None:
     missions = list(islice(schedule(9, NATURAL, "handover", HARDWARE), 10 * BLOCK))
     kinds = Counter(mission.spec.condition for mission in missions)
     drivers = Counter(f"{mission.driver} {mission.version}" for mission in missions)
@@ -135,7 +135,7 @@ def test_missions_come_at_their_shares_and_rare_ones_come_early() -> None:
     assert len({mission.spec.seed for mission in missions}) == len(missions)
 
 
-def test_flags_from_python() -> None:
+def test_record_options_are_parsed() -> None:
     assert parse_shares("nominal=.5, wheel_slip=.5") == {"nominal": 0.5, "wheel_slip": 0.5}
     assert parse_rates("odom=20,scan=5").odom == 20
     assert parse_rates("").imu == 50
@@ -162,7 +162,7 @@ class _Creeper:
     chance = 1.0
 
 
-def test_a_policy_of_your_own_drives_under_its_own_name(tmp_path: Path) -> None:
+def test_custom_policy_is_recorded_by_name(tmp_path: Path) -> None:
     done = record(tmp_path / "log.mcap", RecordingPlan(missions=1, seed=3), policy=_Creeper())
     assert set(done.policies) == {"creeper 3"}
     unsure = _Creeper()

@@ -65,7 +65,7 @@ def driven(
     return sim, np.mean(rows[15:], axis=0)
 
 
-def test_the_stand_in_is_the_model_that_it_was() -> None:
+def test_stand_in_model_is_unchanged() -> None:
     """Every number of it."""
     model, _ = build_model(default_warehouse(), stand_in(AMR.task.body))
     arrays = [
@@ -79,7 +79,7 @@ def test_the_stand_in_is_the_model_that_it_was() -> None:
     assert hashlib.sha256(content).hexdigest()[:16] == "6bfb7a4ecdfa934c"
 
 
-def test_the_stand_in_drives_as_it_did() -> None:
+def test_stand_in_drive_is_unchanged() -> None:
     env = WarehouseVectorEnv(6, seed=5)
     observation, _ = env.reset(seed=5)
     rng = np.random.default_rng(1)
@@ -91,7 +91,7 @@ def test_the_stand_in_drives_as_it_did() -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_it_drives_what_it_is_commanded(name: str) -> None:
+def test_robot_follows_commands(name: str) -> None:
     robot, body, speed, turn = ROBOTS[name]
     commands = [(speed, 0.0), (-speed / 2, 0.0), (0.0, turn), (0.0, -turn / 2)]
     sim, steady = driven(robot, body, commands)
@@ -103,7 +103,7 @@ def test_it_drives_what_it_is_commanded(name: str) -> None:
     assert not sim.diverged.any()
 
 
-def test_a_skid_steer_robot_slides_where_one_axle_rolls() -> None:
+def test_skid_steer_turn_depends_on_friction() -> None:
     """Compare skid steer, whose wheels scrub in every turn, with one axle."""
     sim, _ = driven(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)
@@ -117,7 +117,7 @@ def test_a_skid_steer_robot_slides_where_one_axle_rolls() -> None:
     assert turns["skid_steer", 0.25] > 1.15 * turns["skid_steer", 1.0]
 
 
-def test_its_lidar_is_where_and_as_the_profile_says() -> None:
+def test_lidar_mounting_follows_profile() -> None:
     """A wall ahead is seen by the beam that looks there, also from a lidar mounted backward."""
     body = Body(0.4, 0.4, lidar_x_m=0.1, lidar_yaw_rad=math.pi)
     lidar = Lidar(z_m=0.3, beams=181, angle_min_rad=-math.pi / 2, angle_max_rad=math.pi / 2)
@@ -133,7 +133,7 @@ def test_its_lidar_is_where_and_as_the_profile_says() -> None:
 
 
 @pytest.mark.parametrize("name", ["burger", "husky"])
-def test_a_slippery_floor_and_traffic_apply_to_it(name: str) -> None:
+def test_custom_robot_meets_slip_and_traffic(name: str) -> None:
     robot, body, speed, turn = ROBOTS[name]
     actions = ((0.0, 0.0), (speed, 0.0), (0.5 * speed, turn), (0.0, -turn))
     task = msgspec.structs.replace(AMR.task, body=body, actions=actions)
@@ -150,7 +150,7 @@ def test_a_slippery_floor_and_traffic_apply_to_it(name: str) -> None:
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.08, 0.12])
-def test_a_control_period_of_some_hundredths_of_a_second(period_s: float) -> None:
+def test_short_control_period(period_s: float) -> None:
     robot, body, speed, _ = ROBOTS["burger"]
     task = Task(body=body, actions=((0.0, 0.0), (speed, 0.0)), control_period_s=period_s)
     sim = Simulation(1, task, empty_floor(), 0.01, 1, robot=robot_model(robot, body))
@@ -162,7 +162,7 @@ def test_a_control_period_of_some_hundredths_of_a_second(period_s: float) -> Non
     assert sim.qpos[0, 0] - 30 == pytest.approx(speed * (50 * period_s - 0.1), rel=0.05)
 
 
-def test_a_control_period_that_no_timestep_divides_is_refused() -> None:
+def test_indivisible_control_period_is_rejected() -> None:
     task = Task(body=Body(0.5, 0.4), actions=((0.0, 0.0),), control_period_s=0.133)
     with pytest.raises(ConfigError, match=r"control_period_s = 0\.133 is not a whole number"):
         Simulation(1, task, empty_floor(), 0.01, 1)
@@ -176,12 +176,12 @@ def test_a_control_period_that_no_timestep_divides_is_refused() -> None:
         (Robot(casters_m=((0.3, 0.0),), axle_x_m=0.2), "tips over"),
     ],
 )
-def test_what_cannot_be_built_is_said(robot: Robot, message: str) -> None:
+def test_unbuildable_robot_is_rejected(robot: Robot, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         robot_model(robot, Body(0.5, 0.4))
 
 
-def test_a_robot_wider_than_an_aisle_is_refused() -> None:
+def test_robot_wider_than_aisle_is_rejected() -> None:
     task = msgspec.structs.replace(AMR.task, body=Body(2.5, 1.9))
     with pytest.raises(ConfigError, match=r"1\.9 m wide, but aisle_.* only 1\.80 m: it does"):
         WarehouseVectorEnv(1, task=task, robot=Robot())
@@ -205,7 +205,7 @@ def amr_with(text: str) -> Profile:
     return parse_profile(plain + text, where="here")
 
 
-def test_a_profile_carries_its_robot() -> None:
+def test_profile_carries_robot() -> None:
     profile = amr_with(ROBOT_TOML)
     assert profile.robot is not None
     origins = [
@@ -227,13 +227,13 @@ def test_a_profile_carries_its_robot() -> None:
         ("mass_kg = 55.0", 'mass_kg = 55.0\ndrive = "ackermann"', "needs wheelbase_m"),
     ],
 )
-def test_a_robot_that_is_wrong_is_refused_by_its_key(old: str, new: str, message: str) -> None:
+def test_invalid_robot_key_is_named(old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         amr_with(ROBOT_TOML.replace(old, new, 1))
 
 
 @pytest.mark.parametrize("axle_x_m", [0.0, -0.4])
-def test_a_long_robot_does_not_start_in_a_rack(axle_x_m: float) -> None:
+def test_long_robot_does_not_start_in_rack(axle_x_m: float) -> None:
     floor, outline = default_warehouse(), rectangle(1.2, 0.8, axle_x_m, 25)
     planner, turned = Planner(floor), 0
     for seed in range(25):
@@ -255,7 +255,7 @@ def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -
     return float(near_gap(floor, np.empty((1, 0, 4)), *points, np.inf).min())
 
 
-def test_a_changed_robot_reaches_the_store_without_reading_again(tmp_path: Path) -> None:
+def test_changed_robot_retags_the_store(tmp_path: Path) -> None:
     writer = StoreWriter(tmp_path / "store")
     kept = []
     for table in ("", "\n[robot]\nmass_kg = 40.0\n", "\n[robot]\nmass_kg = 45.0\n"):

@@ -31,7 +31,7 @@ CAR_ACTIONS = (
 
 
 @pytest.mark.parametrize("friction", [1.0, 0.25])
-def test_a_robot_that_steers_drives_commanded_circles(friction: float) -> None:
+def test_ackermann_robot_follows_commands(friction: float) -> None:
     commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.4, -0.4), (-0.4, 0.3)]
     sim, steady = driven(CAR, OUTLINE, commands, friction)
     np.testing.assert_allclose(steady, commands, atol=0.01)
@@ -40,14 +40,14 @@ def test_a_robot_that_steers_drives_commanded_circles(friction: float) -> None:
     assert not sim.diverged.any()
 
 
-def test_it_drives_as_tightly_as_its_steering_allows() -> None:
+def test_turning_radius_is_limited_by_steering() -> None:
     assert CAR.min_turning_radius_m == pytest.approx(TIGHTEST_M)
     _, steady = driven(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
     assert steady[0] == pytest.approx([0.3, 0.3 / TIGHTEST_M], rel=0.02)
     assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # it stands, its wheels turned
 
 
-def test_its_wheels_turn_no_faster_than_they_steer() -> None:
+def test_steering_rate_is_limited() -> None:
     robot = msgspec.structs.replace(CAR, max_steering_rate_radps=1.0)
     task = Task(body=OUTLINE, actions=((0.0, 0.0), (0.4, 0.5)))
     commands = np.array([[(0.4, 0.5)] * 3 + [(0.0, 0.0)] * 5])  # .6 s, then a stop
@@ -76,13 +76,13 @@ def test_its_wheels_turn_no_faster_than_they_steer() -> None:
         ((0.4, 0.8), r"a circle of 0.5 m, and the robot's tightest has 0.731 m"),
     ],
 )
-def test_an_action_that_it_cannot_steer_is_refused(action, message):
+def test_unsteerable_action_is_rejected(action, message):
     task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=((0.0, 0.0), action))
     with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(1, task=task, robot=CAR)
 
 
-def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path: Path) -> None:
+def test_unsteerable_profile_is_read_from_store_only(tmp_path: Path) -> None:
     """Older stores hold such profiles: their rows can be learnt from, without a twin."""
     text = profile_toml(amr_with('\n[robot]\ndrive = "ackermann"\nwheelbase_m = 0.4\n'))
     (tmp_path / "car.toml").write_text(text)
@@ -91,7 +91,7 @@ def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path: Path) ->
     assert parse_profile(text, where="a store").robot is not None
 
 
-def test_the_planner_drives_it_to_its_goals() -> None:
+def test_planner_drives_ackermann_robot_to_goals() -> None:
     task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=CAR_ACTIONS)
     env = WarehouseVectorEnv(12, task=task, robot=CAR, seed=7, conditions={"nominal": 1.0})
     observation, _ = env.reset(seed=7)
@@ -110,13 +110,13 @@ MECANUM = Robot(
 )
 
 
-def test_an_omnidirectional_robot_drives_what_it_is_commanded() -> None:
+def test_omnidirectional_robot_follows_commands() -> None:
     commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.0, 1.0)]
     _, steady = driven(MECANUM, Body(0.6, 0.5), commands)
     np.testing.assert_allclose(steady, commands, atol=0.03)
 
 
-def test_perturbations_apply_to_every_drive() -> None:
+def test_perturbations_apply_to_each_drive_type() -> None:
     """A gain, a worn wheel and a longer way to the wheels: each drive shows them as it must."""
     seen = {}
     for robot, body in ((CAR, OUTLINE), (MECANUM, Body(0.6, 0.5))):

@@ -22,7 +22,7 @@ LATCHED = {"/tf_static", "/map", "/behaviour_policy", "/amcl_pose", PERTURBATION
 
 
 @pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))
-def test_a_recording_holds_frames_map_and_scene(tmp_path, file_format, name):
+def test_recording_contains_frames_map_and_scene(tmp_path, file_format, name):
     kinds = {"near_collision": 1.0, "blocked_aisle": 1.0}
     done = record(
         tmp_path / name, RecordingPlan(format=file_format, missions=2, seed=4, conditions=kinds)
@@ -75,7 +75,7 @@ def test_a_recording_holds_frames_map_and_scene(tmp_path, file_format, name):
     assert len({(m.pose.position.x, m.pose.position.y) for m in walking}) > 2
 
 
-def test_the_foxglove_layout_shows_topics_that_recordings_have() -> None:
+def test_foxglove_layout_shows_recorded_topics() -> None:
     layout = json.loads((ROOT / "docs" / "foxglove.json").read_text())
     panels = layout["configById"]
 

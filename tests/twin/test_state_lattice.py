@@ -35,7 +35,7 @@ def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GO
     return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, window)
 
 
-def test_a_narrow_gap_is_gone_around_and_a_wide_one_is_not() -> None:
+def test_lattice_avoids_narrow_gap_only() -> None:
     start = (AISLE.x_min + 0.2, AISLE.center[1], 0.0)
     through, around = with_gap(0.9).plan(*start), with_gap(0.45).plan(*start)
     assert through is not None
@@ -47,7 +47,7 @@ def test_a_narrow_gap_is_gone_around_and_a_wide_one_is_not() -> None:
         assert np.hypot(*(plan[0] - start[:2])) < 0.15
 
 
-def test_a_tight_gap_must_be_entered_straight() -> None:
+def test_tight_gap_needs_straight_entry() -> None:
     """Pass a .75 m gap with a .7 x .5 m body in line with it, but not askew."""
     lattice = with_gap(0.75)
     in_gap = (AISLE.center[0], AISLE.y_min + 0.375)
@@ -56,7 +56,7 @@ def test_a_tight_gap_must_be_entered_straight() -> None:
     assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it would have to back out
 
 
-def test_time_is_left_by_distance_and_speed() -> None:
+def test_remaining_time_scales_with_speed() -> None:
     inside = (AISLE.x_max - 0.3, AISLE.center[1])
     assert with_gap(0.9, goal=inside).time_s(np.array([*inside, 1.0])) < 0.3
     slow = Motion(BODY.outline_m, ahead_mps=0.25, back_mps=0.1, turn_radps=0.3)
@@ -65,7 +65,7 @@ def test_time_is_left_by_distance_and_speed() -> None:
 
 
 @pytest.mark.parametrize(("layouts", "way"), [("default", True), ("generated:test", False)])
-def test_the_clearance_of_near_points_is_exact(layouts, way, monkeypatch):
+def test_near_clearance_is_exact(layouts, way, monkeypatch):
     monkeypatch.setattr(native, "IS_USED", way and native.IS_USED)
     floor = open_floors(layouts)[-1]
     rng = np.random.default_rng(0)

@@ -125,7 +125,7 @@ def seen_on_lap() -> list[np.ndarray]:
 @pytest.mark.parametrize(
     ("late_s", "frame"), [(0.0, "laser"), (1.5, "laser"), (0.0, "base_link"), (0.0, "/base_scan")]
 )
-def test_scans_make_the_map_by_the_clock_that_fits(tmp_path, late_s, frame):
+def test_scan_map_uses_best_matching_clock(tmp_path, late_s, frame):
     known = OccupancyGrid(hall(), CELL_M)
     scans: dict[str, Any] = {"scanned": True, "scans_late_s": late_s, "scan_frame": frame}
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, **scans)
@@ -135,7 +135,7 @@ def test_scans_make_the_map_by_the_clock_that_fits(tmp_path, late_s, frame):
     assert survey(bag).by == "map"  # which is better known
 
 
-def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
+def test_upside_down_lidar_gives_the_same_map(tmp_path: Path) -> None:
     """Read the mounting from the profile, since no transform gives it."""
     known = OccupancyGrid(hall(), CELL_M)
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=True, clockwise=True)
@@ -149,7 +149,7 @@ def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
     assert shares[0] > 95 > shares[1]
 
 
-def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, shell):
+def test_bag_map_becomes_drivable_floor(tmp_path, shell):
     origin = (-3.0, 2.0, 0.0)
     poses = lap(origin)[:-30]  # not the whole way round
     bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
@@ -183,14 +183,14 @@ def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path, shell):
     assert success.all()
 
 
-def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path) -> None:
+def test_poses_off_the_map_are_rejected_with_frames(tmp_path: Path) -> None:
     away = lap((40.0, 0.0, 0.0))
     bag = write_bag(tmp_path / "bag", poses=away, frame="odom", grid=OccupancyGrid(hall(), CELL_M))
     with pytest.raises(ConfigError, match=r"100% are off the map.*0 on its.*'map'.*'odom'"):
         survey(bag)
 
 
-def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, shell):
+def test_map_contradicted_by_lidar_is_rejected(tmp_path, shell):
     """Refuse a larger, empty room: all poses are on its free floor, but its walls are elsewhere."""
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
@@ -223,16 +223,14 @@ def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(tmp_path, shell):
         ((90, 90), 0.05, (0.0, 0.0, 0.0), np.full(8100, -1, np.int8), "8,100 unknown"),
     ],
 )
-def test_a_map_that_is_none_is_refused_with_its_reason(
-    tmp_path, shape, resolution, origin, data, message
-):
+def test_invalid_map_message_is_rejected(tmp_path, shape, resolution, origin, data, message):
     cells = np.broadcast_to(np.int8(0), shape)
     bag = write_bag(tmp_path / "bag", grid=OccupancyGrid(cells, resolution, origin), data=data)
     with pytest.raises((RecordingError, ConfigError), match=message):
         survey(bag)
 
 
-def test_a_robot_larger_than_its_aisles_is_refused(tmp_path: Path) -> None:
+def test_robot_larger_than_aisles_is_rejected(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=OccupancyGrid(hall(), CELL_M))
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
     assert main([*arguments, "--footprint", "2.5x1.8"]) == 2
@@ -241,7 +239,7 @@ def test_a_robot_larger_than_its_aisles_is_refused(tmp_path: Path) -> None:
         survey(bag, footprint=parse_footprint("3x2.5"))
 
 
-def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path) -> None:
+def test_without_map_floor_is_driven_corridor(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, 0.5)), frame="odom")
     made = survey(bag)
     assert made.by == "corridor"
@@ -254,7 +252,7 @@ def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
-def test_zones_of_a_profile_are_in_the_maps_frame(tmp_path: Path, yaw: float) -> None:
+def test_exported_zones_are_in_map_frame(tmp_path: Path, yaw: float) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, yaw)), frame="odom")
     arguments = ["twin", "layout", "--from", str(bag), "--zones", str(tmp_path / "zones.toml")]
     assert main(arguments) == 0
@@ -275,7 +273,7 @@ def test_zones_of_a_profile_are_in_the_maps_frame(tmp_path: Path, yaw: float) ->
     assert msgspec.to_builtins(Zone("a", (0.0, 0.0, 1.0, 1.0))).keys() == {"name", "box_m"}
 
 
-def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
+def test_floor_picture_is_to_scale(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=OccupancyGrid(hall(), CELL_M))
     assert main(["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.png")]) == 0
     pixels = np.asarray(Image.open(tmp_path / "floor.png")).astype(int)
@@ -299,7 +297,7 @@ def along(rows: pa.Table, poses: np.ndarray, rows_a_pose: int = 1) -> pa.Table:
     return replaced(rows, dict(zip(names, poses[at].T, strict=True)))
 
 
-def test_a_store_gives_the_floor_of_its_recording(tmp_path):
+def test_store_gives_floor_of_its_recordings(tmp_path):
     bag = write_bag(tmp_path / "bag", poses=lap()[:60], grid=OccupancyGrid(hall(), CELL_M))
     recordings = []
     for recording, part in ((1, slice(0, 60)), (2, slice(60, 200))):
@@ -324,7 +322,7 @@ def lapped(recording: int, away_m: float) -> pa.Table:
     return along(rows, lap() + np.array([away_m, 0.0, 0.0]))
 
 
-def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path, shell):
+def test_recordings_in_other_frames_get_own_floors(tmp_path, shell):
     tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
     store = write_store(tmp_path / "store", tables)
     names = [table["recording_id"][0].as_py() for table in tables]
@@ -347,7 +345,7 @@ class _Zones(Checked, frozen=True):
     zone: list[Zone]
 
 
-def test_a_robot_that_hardly_moved_goes_where_it_could() -> None:
+def test_missions_of_barely_moved_robot_use_seen_room() -> None:
     """Send missions into the room that it saw if its own places are too close together."""
     cells = np.full((120, 80), 100, np.int8)
     cells[2:-2, 2:-2] = 0

@@ -12,7 +12,7 @@ from restock.train.twin.survey.poses import candidate_poses, choose_poses
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_scans_are_placed_where_the_robot_was(tmp_path: Path, encoding: str) -> None:
+def test_scans_are_placed_at_robot_pose(tmp_path: Path, encoding: str) -> None:
     messages = drive()
     for _, _, kind, values in messages:
         if kind == "foxglove.LaserScan":

@@ -19,7 +19,7 @@ def environment(kind: str) -> WarehouseVectorEnv:
     return env
 
 
-def test_tracks_are_of_people_who_walk():
+def test_tracks_follow_walking_people():
     env, driver = environment("near_collision"), Operator(epsilon=0.0)
     traffic, off, speeds = env.simulation.traffic, [], []
     for _ in range(120):
@@ -36,7 +36,7 @@ def test_tracks_are_of_people_who_walk():
     assert np.percentile(speeds, 95) < 1.6
 
 
-def test_hardly_anything_is_tracked_where_nobody_walks():
+def test_few_tracks_without_people():
     env, driver, shown = environment("nominal"), Operator(epsilon=0.0), 0
     for _ in range(150):
         env.step(driver.choose(env))
@@ -44,7 +44,7 @@ def test_hardly_anything_is_tracked_where_nobody_walks():
     assert shown < 6
 
 
-def test_an_environment_continues_with_its_tracks():
+def test_restored_environment_keeps_tracks():
     one, other = environment("near_collision"), environment("near_collision")
     rng = np.random.default_rng(0)
     for _ in range(40):

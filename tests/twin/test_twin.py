@@ -45,7 +45,7 @@ def env() -> Iterator[WarehouseVectorEnv]:
     made.close()
 
 
-def test_single_and_vector_environment_are_the_same_environment() -> None:
+def test_single_and_vector_environments_agree() -> None:
     single = gymnasium.make("restock/Warehouse-v0").unwrapped
     vector = WarehouseVectorEnv(1)
     one, _ = single.reset(seed=11)
@@ -58,7 +58,7 @@ def test_single_and_vector_environment_are_the_same_environment() -> None:
         assert earned == earned_too[0]
 
 
-def test_a_seed_gives_the_same_run_whatever_the_threads() -> None:
+def test_seed_gives_same_run_with_any_threads() -> None:
     runs = []
     for nthread, record in ((1, False), (2, False), (1, True)):
         made = WarehouseVectorEnv(6, nthread=nthread)
@@ -70,7 +70,7 @@ def test_a_seed_gives_the_same_run_whatever_the_threads() -> None:
     np.testing.assert_array_equal(runs[0], runs[2])
 
 
-def test_an_episode_is_the_same_in_any_place_and_company() -> None:
+def test_episode_does_not_depend_on_its_slot() -> None:
     spec = EpisodeSpec("near_collision", 42)
     alone, among = WarehouseVectorEnv(1), WarehouseVectorEnv(4, seed=9)
     alone.set_episodes([spec])
@@ -84,7 +84,7 @@ def test_an_episode_is_the_same_in_any_place_and_company() -> None:
 
 
 @pytest.mark.long
-def test_state_continues_bit_for_bit_through_a_file(env, tmp_path):
+def test_saved_state_resumes_bit_exactly(env, tmp_path):
     env.reset(seed=2)
     env.simulation.apply(0, Perturbation(payload_kg=10.0))  # restored by the episode's own
     env.reset(seed=2)
@@ -100,7 +100,7 @@ def test_state_continues_bit_for_bit_through_a_file(env, tmp_path):
     np.testing.assert_array_equal(np.array(roll(fresh, 40, 1)), expected)
 
 
-def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> None:
+def test_state_of_another_environment_is_rejected(env: WarehouseVectorEnv) -> None:
     env.reset(seed=2)
     with pytest.raises(RunError, match="8 environments"):
         WarehouseVectorEnv(2).load_state_dict(env.state_dict())
@@ -109,7 +109,7 @@ def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> N
 
 
 @pytest.mark.parametrize("pickler", ["pickle", "cloudpickle"])
-def test_a_pickled_environment_is_fresh_with_the_same_settings(pickler: str) -> None:
+def test_unpickled_environment_has_same_settings(pickler: str) -> None:
     dumps = pytest.importorskip(pickler).dumps
     made = WarehouseVectorEnv(3, conditions={"wheel_slip": 1.0}, perturbation="friction", seed=5)
     first, _ = made.reset()
@@ -148,7 +148,7 @@ def test_autoreset_keeps_the_final_observation() -> None:
     assert not terminated.any()
 
 
-def test_disabled_autoreset_resets_only_the_masked() -> None:
+def test_disabled_autoreset_resets_masked_environments() -> None:
     made = WarehouseVectorEnv(3, autoreset_mode=AutoresetMode.DISABLED)
     made.reset(seed=1)
     for _ in range(5):
@@ -158,7 +158,7 @@ def test_disabled_autoreset_resets_only_the_masked() -> None:
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_every_signal_is_filled_and_the_tasks_functions_used(kind: str) -> None:
+def test_step_matches_task_functions_and_fills_signals(kind: str) -> None:
     """A command counts as its nearest action: it is seen and rewarded so."""
     env = WarehouseVectorEnv(8, action=kind)
     env.reset(seed=6)
@@ -190,7 +190,7 @@ def test_every_signal_is_filled_and_the_tasks_functions_used(kind: str) -> None:
         previous = np.where(going, action, 0)
 
 
-def test_a_new_plan_makes_no_jump_in_progress() -> None:
+def test_replanning_does_not_jump_progress() -> None:
     specs = [EpisodeSpec("blocked_aisle", seed) for seed in range(16)]
     made = WarehouseVectorEnv(16)
     made.set_episodes(specs)
@@ -218,7 +218,7 @@ def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
     assert sorted(made.episode_number.tolist()) == [-1, 2]
 
 
-def test_a_blow_up_truncates_the_episode_and_is_counted(env, tmp_path, monkeypatch):
+def test_divergence_truncates_episode_and_is_counted(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env.reset(seed=8)
     count = env.diverged
@@ -237,7 +237,7 @@ def test_a_blow_up_truncates_the_episode_and_is_counted(env, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())  # and no MUJOCO_LOG.TXT where the user stands
 
 
-def test_the_block_callback_samples_the_true_motion() -> None:
+def test_block_callback_samples_true_motion() -> None:
     made = WarehouseVectorEnv(2, conditions={"nominal": 1.0})
     made.reset(seed=3)
     states: list[Any] = []
@@ -262,7 +262,7 @@ def test_every_shipped_perturbation_drives(name: str) -> None:
     assert made.diverged == 0
 
 
-def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> None:
+def test_schedule_draws_perturbation_per_episode(tmp_path: Path) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text('name = "fleet"\n[ranges]\npayload_kg = [0, 50]\nlatency_s = [0.05, 0.2]\n')
     schedule = find_perturbation(str(path), where="test")
@@ -298,12 +298,12 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
         ({"layouts": ["default", "default"]}, "layout names must be unique"),
     ],
 )
-def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(**arguments)
 
 
-def test_the_map_is_drawn_with_its_robot() -> None:
+def test_rendered_map_shows_robot() -> None:
     made = WarehouseVectorEnv(1, render_mode="rgb_array")
     made.reset(seed=1)
     (frame,) = made.render()

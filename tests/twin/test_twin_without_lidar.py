@@ -34,7 +34,7 @@ def drive(task):
     return np.array(seen), np.array(earned)[went_on], np.array(tight)[went_on], env
 
 
-def test_it_is_the_same_drive_without_the_entries_of_the_lidar():
+def test_drive_without_lidar_omits_lidar_entries():
     lidar, paid, tight, _ = drive(SEES)
     blind, earned, never, env = drive(BLIND)
     kept = [i for i, name in enumerate(SEES.observation_names) if not name.endswith("deg")]
@@ -48,7 +48,7 @@ def test_it_is_the_same_drive_without_the_entries_of_the_lidar():
     assert env.signals["sector_clearance_m"].shape == (2, 0)
 
 
-def test_the_planner_follows_its_plan_and_stops_for_nothing():
+def test_planner_without_lidar_follows_its_plan():
     env = WarehouseVectorEnv(2, task=BLIND, seed=3)
     observation, _ = env.reset(seed=3)
     planner = PlannerFollower(epsilon=0.0)
@@ -61,7 +61,7 @@ def test_the_planner_follows_its_plan_and_stops_for_nothing():
     env.close()
 
 
-def test_the_twin_labels_what_logs_can_be_labelled_by():
+def test_twin_without_lidar_drops_lidar_conditions():
     evaluated, lost = conditions_in_twin(PROFILE.conditions, PROFILE.signals, lidar=False)
     assert lost == signals_named(PROFILE.conditions) != {}
     assert [one.name for one in evaluated] == ["wheel_slip"]
