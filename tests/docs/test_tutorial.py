@@ -13,10 +13,10 @@ PAGE = ROOT / "docs/tutorial.md"
 
 def check_verdicts(notebook: nbformat.NotebookNode) -> None:
     """Check that the text states the verdicts that its cells print."""
-    said = {cell.source: text_of(cell) for cell in notebook.cells if cell.cell_type == "code"}
+    outputs = {cell.source: text_of(cell) for cell in notebook.cells if cell.cell_type == "code"}
 
     def of(words: str) -> str:
-        (text,) = [text for source, text in said.items() if words in source]
+        (text,) = [text for source, text in outputs.items() if words in source]
         return text
 
     assert "REFUSED" in of("restock compare plain unnormed")

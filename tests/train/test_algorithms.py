@@ -39,7 +39,7 @@ def config(**settings: object) -> TrainConfig:
     return parse_config(document, where="test")
 
 
-def learnt(settings: TrainConfig, updates: int = 500, **given: object) -> np.ndarray:
+def learn_values(settings: TrainConfig, updates: int = 500, **given: object) -> np.ndarray:
     """Return the values (4, 2) after learning from every row of the corridor."""
     rows, _ = corridor()
     learner = Learner(settings, STATES, 2)
@@ -52,15 +52,15 @@ def learnt(settings: TrainConfig, updates: int = 500, **given: object) -> np.nda
 
 @pytest.mark.parametrize("settings", [{}, {"loss__double": False}], ids=str)
 def test_values_agree_with_value_iteration(settings: dict[str, object]) -> None:
-    np.testing.assert_allclose(learnt(config(**settings)), corridor()[1], atol=0.06)
+    np.testing.assert_allclose(learn_values(config(**settings)), corridor()[1], atol=0.06)
 
 
 def test_margin_makes_expert_action_greedy() -> None:
     rows, _ = corridor()
     backs = rows[:, 2 * STATES] == 0  # an expert who goes back
-    values = learnt(config(loss__margin=5.0), logged=len(rows), expert=backs)
+    values = learn_values(config(loss__margin=5.0), logged=len(rows), expert=backs)
     assert (values.argmax(axis=1) == 0).all()
-    none = learnt(
+    none = learn_values(
         config(loss__margin=5.0), logged=len(rows), expert=torch.zeros(8, dtype=torch.bool)
     )
     np.testing.assert_allclose(none, corridor()[1], atol=0.06)

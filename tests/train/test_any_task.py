@@ -43,7 +43,7 @@ def panels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Panel]:
     return {name: panel_of(given, text, folder / name) for name, text in texts.items()}
 
 
-def learnt(panel: Panel, run: Path, *, seed: int = 0, **options: Any) -> list[np.ndarray]:
+def train_on_panel(panel: Panel, run: Path, *, seed: int = 0, **options: Any) -> list[np.ndarray]:
     """Draw 30 batches as a loop would, with three evaluations; return their observations."""
     given = {"audit_share": 1.0, "log_every": 7, "settings": SETTINGS} | options
     buffer = MixtureReplayBuffer(100, *SPACES, "cpu", panel=panel, run=run, seed=seed, **given)
@@ -68,18 +68,18 @@ def learnt(panel: Panel, run: Path, *, seed: int = 0, **options: Any) -> list[np
 
 def test_record_matches_sampled_batches(panels: dict[str, Panel], tmp_path: Path) -> None:
     panel = panels["quotas"]
-    batches = learnt(panel, tmp_path / "run")
+    batches = train_on_panel(panel, tmp_path / "run")
     row_of = {row.tobytes(): at for at, row in enumerate(panel.rows[:, :3])}
     rows = [[row_of[row.tobytes()] for row in batch] for batch in batches]
     drawn = np.concatenate(rows)
     names = panel.meta["condition"].to_numpy()[drawn]
     episodes = Counter(panel.meta["episode_id"].to_numpy()[drawn].tolist())
     tables = run_tables(tmp_path / "run")
-    told = Counter[str]()
+    recorded = Counter[str]()
     for row in tables["conditions"]:
-        told[row["condition"]] += row["drawn_rows"]
-    assert told == Counter(names.tolist())
-    assert told["rare"] == told["nominal"] == 30 * 16
+        recorded[row["condition"]] += row["drawn_rows"]
+    assert recorded == Counter(names.tolist())
+    assert recorded["rare"] == recorded["nominal"] == 30 * 16
     sampled = Counter[str]()
     for row in tables["sampled_episodes"]:
         sampled[row["episode"]] += row["drawn_rows"]
@@ -93,7 +93,7 @@ def test_runs_fed_differently_are_incomparable(panels: dict[str, Panel], tmp_pat
     }
     for name, paths in runs.items():
         for seed, path in enumerate(paths):
-            learnt(panels[name], path, seed=seed)
+            train_on_panel(panels[name], path, seed=seed)
     refused = compare(runs["quotas"], runs["uniform"])
     assert refused.verdict == "incomparable"
     assert "panel.id" in [difference.setting for difference in refused.refused]
@@ -136,7 +136,7 @@ def test_diagnosis_names_missing_record(
     panels: dict[str, Panel], tmp_path: Path, lacking: str
 ) -> None:
     if lacking == "target":
-        learnt(panels["quotas"], tmp_path / "run", settings={})
+        train_on_panel(panels["quotas"], tmp_path / "run", settings={})
     else:
         buffer = MixtureReplayBuffer(9, *SPACES, panel=panels["quotas"], run=tmp_path / "run")
         buffer.sample(32)
@@ -155,6 +155,6 @@ def test_wrong_observation_size_is_rejected(panels: dict[str, Panel]) -> None:
 def test_profile_of_generic_task_run_is_rejected(panels: dict[str, Panel], tmp_path: Path) -> None:
     from restock.train.run.run_profile import profile_of_run
 
-    learnt(panels["quotas"], tmp_path / "run")
+    train_on_panel(panels["quotas"], tmp_path / "run")
     with pytest.raises(RestockError, match="a table of another task"):
         profile_of_run(Run.open(tmp_path / "run"))

@@ -61,14 +61,14 @@ def _drive(seed: int) -> FedRows:
     return drive_twin(profile.task, profile.conditions, seed=seed, robots=8, steps=300)
 
 
-def _swapped(rows: FedRows) -> FedRows:
+def _mirror_turns(rows: FedRows) -> FedRows:
     """Left and right exchanged wherever an action stands, in the observations too."""
     table = [tuple(action) for action in rows.task.actions]
     other = np.array([table.index((speed, -turn if turn else turn)) for speed, turn in table])
-    return _acted(rows, other[rows.action])
+    return _set_actions(rows, other[rows.action])
 
 
-def _acted(rows: FedRows, action: Ints) -> FedRows:
+def _set_actions(rows: FedRows, action: Ints) -> FedRows:
     """Other actions (N,) in the logs: observations hold them too."""
     first, count = rows.task.observation_names.index("previous_action_0"), len(rows.task.actions)
     held, before = np.eye(count, dtype=np.float32)[action], rows.joined.nonzero()[0]
@@ -78,12 +78,12 @@ def _acted(rows: FedRows, action: Ints) -> FedRows:
     return replace(rows, action=action, observation=observation, next_observation=after)
 
 
-def _late(rows: FedRows) -> FedRows:
+def _delay_actions(rows: FedRows) -> FedRows:
     place, known = rows.before(2)
-    return _acted(rows, np.where(known, rows.action[place], 0))
+    return _set_actions(rows, np.where(known, rows.action[place], 0))
 
 
-def _entries(rows: FedRows, change: Callable[..., None], *names: str) -> FedRows:
+def _change_entries(rows: FedRows, change: Callable[..., None], *names: str) -> FedRows:
     """Return rows whose observations are changed; `change` gets one and the places of `names`."""
     places = [rows.task.observation_names.index(name) for name in names]
     made = [rows.observation.copy(), rows.next_observation.copy()]
@@ -92,31 +92,31 @@ def _entries(rows: FedRows, change: Callable[..., None], *names: str) -> FedRows
     return replace(rows, observation=made[0], next_observation=made[1])
 
 
-def _added(rows: FedRows, to: str, of: str, by: float) -> FedRows:
+def _add_entry(rows: FedRows, to: str, of: str, by: float) -> FedRows:
     def change(held: Any, at: int, other: int) -> None:
         held[:, at] += by * held[:, other]
 
-    return _entries(rows, change, to, of)
+    return _change_entries(rows, change, to, of)
 
 
-def _gyroscope(rows: FedRows, by: Any, bias: float = 0.0) -> FedRows:
+def _change_gyroscope(rows: FedRows, by: Any, bias: float = 0.0) -> FedRows:
     def change(held: Any, gyro: int, slip: int) -> None:
         read = by * held[:, gyro] + bias
         held[:, slip] += held[:, gyro] - read
         held[:, gyro] = read
 
-    return _entries(rows, change, "gyro_yaw_rate", "slip_yaw_rate")
+    return _change_entries(rows, change, "gyro_yaw_rate", "slip_yaw_rate")
 
 
-def _shuffled(values: Any) -> Any:
+def _shuffle(values: Any) -> Any:
     return np.random.default_rng(0).permutation(values)
 
 
-def _tilted(held: Any, at: int) -> None:
+def _tilt(held: Any, at: int) -> None:
     held[:, at] += 0.1  # of 5 m/s2
 
 
-def _twice(rows: FedRows, from_step: int = 0) -> FedRows:
+def _repeat_episodes(rows: FedRows, from_step: int = 0) -> FedRows:
     again: Any = np.flatnonzero((rows.episode < 3) & (rows.step >= from_step))
     both = rows.take(np.append(np.arange(len(rows)), again))
     both.episode[len(rows) :] += rows.episode.max() + 1
@@ -124,7 +124,7 @@ def _twice(rows: FedRows, from_step: int = 0) -> FedRows:
     return both
 
 
-def _lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
+def _change_lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
     """Return rows with other clearances (N, S) in m, of which entries are roots."""
     first = rows.task.observation_names.index("clearance_-175deg")
     most, count = rows.task.range_max_m, rows.task.sectors
@@ -134,7 +134,7 @@ def _lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
         seen = change(held[:, sectors] ** 2 * most)
         held[:, sectors] = np.sqrt(np.clip(seen / most, 0, 1))
 
-    made = _entries(rows, put)
+    made = _change_entries(rows, put)
     before, known = made.before(1)
     closing = made.sectors() - made.sectors()[before] * known[:, None]
     made.observation[known, first + count : first + 2 * count] = closing[known]
@@ -142,7 +142,7 @@ def _lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
     return made
 
 
-def _cut(rows: FedRows) -> FedRows:
+def _cut_episodes(rows: FedRows) -> FedRows:
     """Return episodes without their last second, stored as terminated there."""
     following, known = rows.before(-5)
     cut = rows.take(known & (rows.episode[following] == rows.episode))
@@ -150,34 +150,35 @@ def _cut(rows: FedRows) -> FedRows:
 
 
 PLANTED: dict[str, tuple[Plant, str]] = {
-    "a gyroscope in degrees": (lambda rows: _gyroscope(rows, 180 / np.pi), "SENSOR_SCALED"),
-    "a gyroscope with a bias": (lambda rows: _gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
-    "a heading 8 degrees off": (lambda rows: _added(rows, "lateral_speed", "localised_speed", 0.14),
+    "a gyroscope in degrees": (lambda rows: _change_gyroscope(rows, 180 / np.pi), "SENSOR_SCALED"),
+    "a gyroscope with a bias": (lambda rows: _change_gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
+    "a heading 8 degrees off": (lambda r: _add_entry(r, "lateral_speed", "localised_speed", 0.14),
                                 "SENSOR_TURNED"),
     "a pose .2 m ahead of the centre": (
-        lambda rows: _added(rows, "lateral_speed", "gyro_yaw_rate", 0.2), "SENSOR_OFF_CENTRE"),
-    "an inertial unit that is tilted": (lambda rows: _entries(rows, _tilted, "accel_x"),
+        lambda rows: _add_entry(rows, "lateral_speed", "gyro_yaw_rate", 0.2), "SENSOR_OFF_CENTRE"),
+    "an inertial unit that is tilted": (lambda rows: _change_entries(rows, _tilt, "accel_x"),
                                         "SENSOR_BIASED"),
-    "one robot's pieces again": (lambda rows: _twice(rows, from_step=10), "EPISODES_REPEATED"),
-    "a lidar's ranges halved": (lambda rows: _lidar(rows, lambda seen: seen / 2), "LIDAR_SCALED"),
+    "one robot's pieces again": (lambda r: _repeat_episodes(r, from_step=10), "EPISODES_REPEATED"),
+    "a lidar's ranges halved": (lambda r: _change_lidar(r, lambda seen: seen / 2), "LIDAR_SCALED"),
     "left and right in half of the rows": (
-        lambda r: _acted(r, np.where(_shuffled(r.step % 2 > 0), _swapped(r).action, r.action)),
+        lambda r: _set_actions(
+            r, np.where(_shuffle(r.step % 2 > 0), _mirror_turns(r).action, r.action)),
         "ACTIONS_MIXED"),
-    "left and right": (_swapped, "ACTIONS_MIRRORED"),
-    "actions .4 s late": (_late, "ACTIONS_SHIFTED"),
-    "actions changed after ingest": (lambda rows: replace(rows, action=_swapped(rows).action),
+    "left and right": (_mirror_turns, "ACTIONS_MIRRORED"),
+    "actions .4 s late": (_delay_actions, "ACTIONS_SHIFTED"),
+    "actions changed after ingest": (lambda rows: replace(rows, action=_mirror_turns(rows).action),
                                      "ACTIONS_CHANGED"),
     "rewards twice": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
-    "rewards of other rows": (lambda rows: replace(rows, reward=_shuffled(rows.reward)), "REWARD_"),
+    "rewards of other rows": (lambda rows: replace(rows, reward=_shuffle(rows.reward)), "REWARD_"),
     "terminations": (lambda rows: replace(rows, terminated=rows.terminated & False),
                      "TERMINATIONS_LOST"),
-    "time-outs as terminations": (_cut, "TERMINATIONS_WRONG"),
+    "time-outs as terminations": (_cut_episodes, "TERMINATIONS_WRONG"),
     "next observations of other rows": (
-        lambda rows: replace(rows, next_observation=_shuffled(rows.next_observation)),
+        lambda rows: replace(rows, next_observation=_shuffle(rows.next_observation)),
         "ROWS_APART"),
     "observations of the step after": (
         lambda rows: replace(rows, observation=rows.next_observation), "FUTURE_IN_OBSERVATION"),
-    "episodes twice": (_twice, "EPISODES_REPEATED"),
+    "episodes twice": (_repeat_episodes, "EPISODES_REPEATED"),
 }  # fmt: skip
 
 
@@ -200,10 +201,10 @@ def test_planted_fault_is_named(logs: FedRows, twin: FedRows, fault: str) -> Non
         assert found.verdict == "BUFFER"
         assert found.findings[0].cause.startswith(cause)
         rows = {row.check: row for row in found.comparisons}
-        assert all(rows[check].status == "off" for check in _named(found))
+        assert all(rows[check].status == "off" for check in _evidence(found))
 
 
-def _named(found: RowDiagnosis) -> list[str]:
+def _evidence(found: RowDiagnosis) -> list[str]:
     return [check for one in found.findings for check in one.evidence]
 
 
@@ -247,28 +248,28 @@ def test_fault_of_one_robot_names_its_recordings(kind, tagged, part, logs, twin)
     assert (
         compared.note == f"3 {kind} with 500 rows were compared: {several} of {several} recordings"
     )
-    found = diagnose_rows(_gyroscope(fleet, np.where(third == "r2", 1.5, 1.0)), twin)
+    found = diagnose_rows(_change_gyroscope(fleet, np.where(third == "r2", 1.5, 1.0)), twin)
     assert [one.cause for one in found.findings] == ["SENSOR_SCALED"]
     assert f"in 1 of 3 {kind} ({part}): the scale of the logs' gyroscope is 1." in (
         found.findings[0].text
     )
     assert all(check.endswith(f", {part}") for check in found.findings[0].evidence)
-    assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
+    assert {row.check for row in found.comparisons if row.off} >= {*_evidence(found), "recordings"}
 
 
-def _drivers(rows: FedRows, *names: str) -> Any:
+def _alternate_drivers(rows: FedRows, *names: str) -> Any:
     return np.array(names)[rows.episode // 3 % 2]
 
 
-def _of_one(rows: FedRows, plant: Plant) -> FedRows:
+def _plant_in_one_robot(rows: FedRows, plant: Plant) -> FedRows:
     """Plant a fault in the second of three robots, each with two drivers."""
     robot = np.array([f"r{one}" for one in rows.episode % 3])
-    driver = _drivers(rows, "planner", "operator")
+    driver = _alternate_drivers(rows, "planner", "operator")
 
     def without_proposal(held: Any, *places: int) -> None:
         held[np.ix_(driver == "operator", places)] = 0
 
-    rows = _entries(rows, without_proposal, "nav_known", "nav_speed", "nav_yaw_rate")
+    rows = _change_entries(rows, without_proposal, "nav_known", "nav_speed", "nav_yaw_rate")
     counted = np.full((len(rows), 2), len(rows))
     rows = replace(rows, recording=robot, robot=robot, driver=driver, counted=counted)
     faulty = plant(rows)
@@ -283,14 +284,14 @@ def _of_one(rows: FedRows, plant: Plant) -> FedRows:
 
 OF_ONE: dict[str | None, tuple[Plant, str]] = {
     None: (lambda rows: rows, ""),
-    "wheels": (lambda rows: _added(rows, "wheel_speed", "wheel_speed", -0.08),
+    "wheels": (lambda rows: _add_entry(rows, "wheel_speed", "wheel_speed", -0.08),
                "the scale of the logs' wheels (speed) is 0.92"),
-    "short": (lambda rows: _lidar(rows, lambda seen: seen - 0.25), "lidar differ by -0.2"),
-    "blind": (lambda rows: _lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
+    "short": (lambda rows: _change_lidar(rows, lambda seen: seen - 0.25), "lidar differ by -0.2"),
+    "blind": (lambda rows: _change_lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
               "racks and walls in 25% of its sectors (degrees from ahead: -175,"),
     "elsewhere": (lambda r: replace(r, pose=r.pose + np.outer(r.episode % 2, [1, 1, 0])),
                   "lidar does not see the racks that should be near the pose"),
-    "drivers": (lambda rows: replace(rows, driver=_drivers(rows, "operator", "planner")),
+    "drivers": (lambda rows: replace(rows, driver=_alternate_drivers(rows, "operator", "planner")),
                 "driven like another policy"),
     "lost": (lambda rows: replace(rows, counted=np.add(rows.counted, [40, 0])),
              "of the rows that ingest wrote for these recordings are gone"),
@@ -299,16 +300,16 @@ OF_ONE: dict[str | None, tuple[Plant, str]] = {
 
 @pytest.mark.parametrize("fault", OF_ONE)
 def test_fault_of_one_robot_is_the_only_finding(logs, twin, fault):
-    plant, said = OF_ONE[fault]
-    fleet, floors = _of_one(logs, plant), open_floors("default")
+    plant, message = OF_ONE[fault]
+    fleet, floors = _plant_in_one_robot(logs, plant), open_floors("default")
     found = diagnose_rows(fleet, twin, files={"r1": "monday.mcap"}, floors=floors)
     texts = [one.text for one in found.findings]
     start = "in 1 of 3 robots (robot r1: monday.mcap): "
     assert all(text.startswith(start) for text in texts)
-    assert [said in text for text in texts] == [True] * (fault is not None)
+    assert [message in text for text in texts] == [True] * (fault is not None)
 
 
-def _in_time(rows: FedRows, name: str, change: Callable[..., Any]) -> FedRows:
+def _change_series(rows: FedRows, name: str, change: Callable[..., Any]) -> FedRows:
     """Return rows with an entry changed row by row: next observations keep to the rows after."""
     at = rows.task.observation_names.index(name)
     observation, after = rows.observation.copy(), rows.next_observation.copy()
@@ -318,20 +319,20 @@ def _in_time(rows: FedRows, name: str, change: Callable[..., Any]) -> FedRows:
     return replace(rows, observation=observation, next_observation=after)
 
 
-def _at_ends(rows: FedRows) -> FedRows:
+def _continue_at_ends(rows: FedRows) -> FedRows:
     ends, begins = np.flatnonzero(rows.last), np.flatnonzero(np.append(True, rows.last[:-1]))
     after = rows.next_observation.copy()
     after[ends] = rows.observation[np.roll(begins, -1)]
     return replace(rows, next_observation=after)
 
 
-def _repeated_at_ends(rows: FedRows) -> FedRows:
+def _repeat_at_ends(rows: FedRows) -> FedRows:
     after = rows.next_observation.copy()
     after[rows.last] = rows.observation[rows.last]
     return replace(rows, next_observation=after)
 
 
-def _open_loop(rows: FedRows) -> FedRows:
+def _copy_command(rows: FedRows) -> FedRows:
     """Report the command as the wheels' speed, after the step and before the next one."""
     at = rows.task.observation_names.index("wheel_speed")
     observation, after = rows.observation.copy(), rows.next_observation.copy()
@@ -341,10 +342,10 @@ def _open_loop(rows: FedRows) -> FedRows:
     return replace(rows, observation=observation, next_observation=after)
 
 
-def _slow_and_wrong(rows: FedRows) -> FedRows:
+def _hold_wrong_values(rows: FedRows) -> FedRows:
     """Hold a gyroscope for four steps, at values of other rows."""
     row = np.arange(len(rows)) // 4 * 4
-    read = _in_time(rows, "gyro_yaw_rate", lambda one: np.roll(one, 99)[row])
+    read = _change_series(rows, "gyro_yaw_rate", lambda one: np.roll(one, 99)[row])
     for wrong, right in ((read.observation, rows.observation),
                          (read.next_observation, rows.next_observation)):  # fmt: skip
         gyro, slip = map(rows.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
@@ -352,30 +353,30 @@ def _slow_and_wrong(rows: FedRows) -> FedRows:
     return read
 
 
-def _without_returns(seen: Any) -> Any:
+def _drop_returns(seen: Any) -> Any:
     return np.where((seen > 3.99) & (np.arange(36) % 9 == 0), 0.0, seen)
 
 
-def _cut_by_goals(rows: FedRows) -> FedRows:
+def _cut_at_new_goals(rows: FedRows) -> FedRows:
     """Cut a robot's episodes at their end; the next one goes on in the next step."""
     begins = (1 + np.cumsum(rows.robot == "r1")) * round(1e9 * rows.task.control_period_s)
     return replace(rows, logged_ns=begins, terminated=rows.terminated & False,
                    truncated=rows.last)  # fmt: skip
 
 
-def _proposed(rows: FedRows) -> FedRows:
+def _follow_proposals(rows: FedRows) -> FedRows:
     fastest_mps, fastest_radps = np.abs(rows.task.actions).max(axis=0)  # the units of observations
     speed_mps = rows.now("nav_speed") * fastest_mps
-    return _acted(
+    return _set_actions(
         rows, nearest_action(rows.task, speed_mps, rows.now("nav_yaw_rate") * fastest_radps)[0]
     )
 
 
-def _clipped(held: Any, at: int) -> None:
+def _clip(held: Any, at: int) -> None:
     held[:, at] = held[:, at].clip(-0.5, 0.5)
 
 
-def _split(rows: FedRows) -> FedRows:
+def _split_episodes(rows: FedRows) -> FedRows:
     half = np.bincount(rows.episode)[rows.episode] // 2
     second = rows.step >= half
     return replace(rows, episode=2 * rows.episode + second, step=rows.step - second * half)
@@ -383,40 +384,41 @@ def _split(rows: FedRows) -> FedRows:
 
 PART_OF: dict[str | None, tuple[Plant, str]] = {
     None: (lambda rows: rows, ""),
-    "saturated": (lambda r: _entries(r, _clipped, "wheel_speed"),
+    "saturated": (lambda r: _change_entries(r, _clip, "wheel_speed"),
                   "wheels (speed) is never beyond 0.5"),
-    "rounded": (lambda r: _in_time(r, "wheel_speed", lambda one: np.round(one, 1)),
+    "rounded": (lambda r: _change_series(r, "wheel_speed", lambda one: np.round(one, 1)),
                 "wheels (speed) has few different values"),
-    "zeros": (lambda r: _in_time(r, "wheel_speed", lambda one: one * (np.arange(len(r)) % 9 > 0)),
+    "zeros": (lambda r: _change_series(r, "wheel_speed",
+                                       lambda one: one * (np.arange(len(r)) % 9 > 0)),
               "wheels (speed) reads 0 in 11%"),
-    "held": (lambda r: _in_time(r, "wheel_speed",
+    "held": (lambda r: _change_series(r, "wheel_speed",
                                 lambda one: one[np.arange(len(r)) - np.arange(len(r)) % 4]),
              "wheels (speed) keeps its value in 7"),
-    "late": (lambda r: _in_time(r, "wheel_speed",
+    "late": (lambda r: _change_series(r, "wheel_speed",
                                 lambda one: np.where(r.episode % 8 < 4, np.roll(one, 5), one)),
              "wheels (speed) is 1 s (5 steps) late"),
-    "jumps": (lambda r: _in_time(r, "localised_speed",
+    "jumps": (lambda r: _change_series(r, "localised_speed",
                                  lambda one: one + 2.5 * (r.step % 20 == 9)),
               "the logs' pose has single values that are far off"),
-    "copied": (_open_loop, "wheels (speed) are exactly the command"),
-    "opposite": (lambda r: _gyroscope(r, np.where(r.episode % 8 < 4, -1.0, 1.0)),
+    "copied": (_copy_command, "wheels (speed) are exactly the command"),
+    "opposite": (lambda r: _change_gyroscope(r, np.where(r.episode % 8 < 4, -1.0, 1.0)),
                  "the sign of the logs' gyroscope is opposite"),
-    "not held": (_slow_and_wrong, "the logs' gyroscope does not follow"),
-    "no returns": (lambda r: _lidar(r, _without_returns), "the logs' lidar reads 0"),
-    "goals": (_cut_by_goals, "another goal is in force before the goal is reached"),
-    "proposals": (_proposed, "of the actions of 'planner' are navigation's proposals"),
-    "ends again": (_repeated_at_ends, "it repeats the row's own observation"),
+    "not held": (_hold_wrong_values, "the logs' gyroscope does not follow"),
+    "no returns": (lambda r: _change_lidar(r, _drop_returns), "the logs' lidar reads 0"),
+    "goals": (_cut_at_new_goals, "another goal is in force before the goal is reached"),
+    "proposals": (_follow_proposals, "of the actions of 'planner' are navigation's proposals"),
+    "ends again": (_repeat_at_ends, "it repeats the row's own observation"),
     "rewards": (lambda r: replace(r, reward=np.where(r.step % 3, r.reward, np.roll(r.reward, 1))),
                 "are not exactly the task's rewards"),
-    "ends": (_at_ends, "the last next observation does not follow from its row"),
-    "split": (_split, "stop where another episode begins"),
+    "ends": (_continue_at_ends, "the last next observation does not follow from its row"),
+    "split": (_split_episodes, "stop where another episode begins"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", PART_OF)
 def test_partial_fault_is_found_beside_other_robots(logs, twin, fault, monkeypatch):
     monkeypatch.setattr(before_training, "MIN_ROWS", 300)
-    plant, said = PART_OF[fault]
+    plant, message = PART_OF[fault]
     robot = np.array([f"r{one}" for one in logs.episode % 4])
     driver = np.full(len(logs), "planner")
     stamp_ns = 10**12 * (1 + logs.episode) + 10**9 * logs.step
@@ -432,7 +434,7 @@ def test_partial_fault_is_found_beside_other_robots(logs, twin, fault, monkeypat
     found = diagnose_rows(together, twin)
     texts = [one.text for one in found.findings]
     assert [text for text in texts if not text.startswith("in 1 of 4 robots (robot r1)")] == []
-    assert [text for text in texts if said in text] or fault is None, texts
+    assert [text for text in texts if message in text] or fault is None, texts
 
 
 def test_proposals_are_compared_in_observation_units(logs: FedRows) -> None:
@@ -490,7 +492,7 @@ def test_unpursued_goals_are_not_a_scaled_plan(tuesday):
     def away(held: Any, place: int) -> None:  # the robot drives away from them
         held[rows.episode % 2 == 0, place] = 0.95 - held[rows.episode % 2 == 0, place]
 
-    found = diagnose_rows(_entries(rows, away, "goal_distance"), None)
+    found = diagnose_rows(_change_entries(rows, away, "goal_distance"), None)
     assert "GOALS_OF_OTHERS" in {one.cause for one in found.findings}
     assert not any("plan is" in one.text for one in found.findings)
     (one,) = [one for one in found.findings if one.cause == "GOALS_OF_OTHERS"]
@@ -568,7 +570,7 @@ def test_diagnose_reports_findings_for_noise(
     assert {row["status"] for row in document["comparisons"]} >= {"off", "not run"}
 
 
-def checked(opened: OpenedRows) -> list[Comparison]:
+def run_checks(opened: OpenedRows) -> list[Comparison]:
     return [one.of(opened.rows) for one in opened.checks]
 
 
@@ -577,7 +579,7 @@ def test_labels_and_ends_are_recomputed_from_signals(tmp_path: Path) -> None:
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")
     assert (np.diff(as_stored.rows.logged_ns)[as_stored.rows.joined[1:]] > 0).all()
-    compared = {row.check: row for row in checked(as_stored)}
+    compared = {row.check: row for row in run_checks(as_stored)}
     assert len(compared) > 3
     assert {row.status for row in compared.values()} <= {"ok", "not run"}
     assert compared["terminations"].status == "ok"
@@ -592,7 +594,7 @@ def test_labels_and_ends_are_recomputed_from_signals(tmp_path: Path) -> None:
     other = StoreWriter(tmp_path / "other")
     other.write(store.live(row["recording_id"]), replaced(rows, changed))
     opened = open_rows(tmp_path / "other")
-    off = [row.check for row in checked(opened) if row.off]
+    off = [row.check for row in run_checks(opened) if row.off]
     assert off == ["labels: blocked_aisle", "terminations"]
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
@@ -620,12 +622,12 @@ def test_panel_is_compared_with_its_store(tmp_path: Path) -> None:
     profile = load_profile("warehouse_amr")
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
     panel = panel_of(tmp_path / "store", EVERY + NO_SPLIT, tmp_path / "panel")
-    compared = [row for row in checked(open_rows(panel.path)) if row.check.startswith("fed ")]
+    compared = [row for row in run_checks(open_rows(panel.path)) if row.check.startswith("fed ")]
     assert len(compared) > 1
     assert {(row.status, row.logs) for row in compared} == {("ok", 0.0)}
 
     meta = panel.meta
-    _rewrite(panel, condition=["blocked_aisle"] * len(meta))
+    _rewrite_panel(panel, condition=["blocked_aisle"] * len(meta))
     opened = open_rows(panel.path)
     assert (np.diff(opened.rows.logged_ns)[opened.rows.joined[1:]] > 0).all()
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.checks).findings
@@ -633,12 +635,12 @@ def test_panel_is_compared_with_its_store(tmp_path: Path) -> None:
     assert finding.cause == "LABELS_CHANGED"
     assert "nominal 100%" in finding.text
 
-    _rewrite(panel, action=[99, *meta["action"].to_pylist()[1:]])
+    _rewrite_panel(panel, action=[99, *meta["action"].to_pylist()[1:]])
     with pytest.raises(PanelError, match=r"has action 99, and the task has actions 0 to \d"):
         open_rows(panel.path)
 
 
-def _rewrite(panel: Panel, **columns: list[Any]) -> None:
+def _rewrite_panel(panel: Panel, **columns: list[Any]) -> None:
     """Other software's doing: columns of `meta`, and a seal that agrees with them."""
     path, header = panel.path / META, panel.path / HEADER
     meta = replaced(panel.meta, columns)
@@ -656,7 +658,7 @@ def _rewrite(panel: Panel, **columns: list[Any]) -> None:
 def test_run_verdict_includes_its_rows(logs, twin, of_run, together):
     alone = Diagnosis(of_run, [of_run], [], [], ["a figure"], "none needed")
     assert with_rows(alone, diagnose_rows(logs, twin)) == alone
-    both = with_rows(alone, diagnose_rows(_swapped(logs), twin))
+    both = with_rows(alone, diagnose_rows(_mirror_turns(logs), twin))
     assert (both.cause, both.runs) == (together, [of_run])
     assert both.evidence[-1] == "rows: ACTIONS_MIRRORED: the logs' left is the twin's right"
     why = f"{of_run} by the run's own figures, {together} with the rows that were fed:"

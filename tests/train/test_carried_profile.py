@@ -55,7 +55,7 @@ FLAGS = [word for text in TINY for word in ("--set", text)]
 TUESDAY, MONDAY = str(ROOT / "sample_logs/amr_tuesday"), str(ROOT / "sample_logs/amr_monday.mcap")
 
 
-def ingest(folder: Path, name: str, recording: str, store: Path) -> None:
+def ingest_with_profile(folder: Path, name: str, recording: str, store: Path) -> None:
     """By a profile of this name, whose files are gone afterwards."""
     profile = folder / f"{name}.toml"
     profile.write_text(SHORTER.replace('name = "warehouse_amr"', f'name = "{name}"', 1) + OWN)
@@ -69,14 +69,14 @@ def ingest(folder: Path, name: str, recording: str, store: Path) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a store, its panel and a run of it, by a profile whose files are gone."""
     folder = tmp_path_factory.mktemp("carried")
-    ingest(folder, "mine", TUESDAY, folder / "store")
+    ingest_with_profile(folder, "mine", TUESDAY, folder / "store")
     assert main(["mix", str(folder / "store"), "--out", str(folder / "panel")]) == 0
     given = ["--panel", str(folder / "panel"), "--out", str(folder / "run")]
     assert main(["train", *given, *FLAGS]) == 0
     return folder
 
 
-def carrying(folder: Path, text: str) -> Panel:
+def panel_with_profile(folder: Path, text: str) -> Panel:
     """Return that panel with another text of its profile."""
     panel = Panel.open(folder / "panel")
     header = msgspec.structs.replace(panel.header, profile_toml=text)
@@ -145,7 +145,7 @@ def test_carried_profile_is_as_restricted_as_a_file(folder, text, problem):
     with pytest.raises(ConfigError, match=problem):
         parse_profile(text, where="a panel")
     with pytest.raises(PanelError, match=r"that it contains cannot be read") as error:
-        profile_of_panel(carrying(folder, text))
+        profile_of_panel(panel_with_profile(folder, text))
     assert error.value.remedy is not None
     assert "--set profile=mine.toml" in error.value.remedy
 

@@ -28,7 +28,7 @@ def few_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policies, "UPDATES", (50, 100))
 
 
-def driven_by_a_rule(recording: int, who: str, *, chance: bool = False) -> pa.Table:
+def rows_of_rule_driver(recording: int, who: str, *, chance: bool = False) -> pa.Table:
     """Rows whose driver turns by the side on which the near waypoint is, or by chance."""
     table = recording_transitions(recording, task=TASK)
     rng = np.random.default_rng(recording)
@@ -46,7 +46,7 @@ def driven_by_a_rule(recording: int, who: str, *, chance: bool = False) -> pa.Ta
 @pytest.fixture(scope="module")
 def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
     folder = tmp_path_factory.mktemp("cloned")
-    tables = [driven_by_a_rule(1, "planner"), driven_by_a_rule(2, "teleop")]
+    tables = [rows_of_rule_driver(1, "planner"), rows_of_rule_driver(2, "teleop")]
     return panel_of(write_store(folder / "store", tables, task=TASK), MIXTURE, folder / "panel")
 
 
@@ -86,7 +86,7 @@ def test_clone_is_cached(panel, tmp_path, monkeypatch):
 
 
 def test_clone_of_random_driver_is_poor(tmp_path: Path) -> None:
-    tables = [driven_by_a_rule(recording, "teleop", chance=True) for recording in (1, 2)]
+    tables = [rows_of_rule_driver(recording, "teleop", chance=True) for recording in (1, 2)]
     store = write_store(tmp_path / "store", tables, task=TASK)
     panel = panel_of(store, MIXTURE, tmp_path / "panel")
     reported = load_cloned(Run.open(kept_run(tmp_path / "run", panel=panel)), "cloned").quality
@@ -112,14 +112,14 @@ def test_eval_drives_the_clone(panel, tmp_path, shell):
 
 
 @pytest.mark.parametrize(
-    ("policy", "said"),
+    ("policy", "message"),
     [
         ("cloned:nobody", "its logs have no driver named 'nobody'"),
         ("cloned:", "there is no 'cloned:'"),
     ],
 )
-def test_clone_of_unknown_driver_is_rejected(panel, tmp_path, policy, said, shell):
+def test_clone_of_unknown_driver_is_rejected(panel, tmp_path, policy, message, shell):
     run = kept_run(tmp_path / "run", panel=panel)
-    assert said in shell.err("eval", run, "--policies", policy, "--dry-run")
+    assert message in shell.err("eval", run, "--policies", policy, "--dry-run")
     none = kept_run(tmp_path / "none")
     assert "did not learn from logs" in shell.err("eval", none, "--policies", "cloned", "--dry-run")

@@ -86,8 +86,8 @@ def test_run_reports_cloned_rows_and_updates(panel: Panel, tmp_path: Path) -> No
         prepared
     )
     misspelt = [*logged, "teacher.policies=['operator', 'plannner']"]
-    said = describe_run(prepare_new(tmp_path / "run", panel.path, None, misspelt))
-    assert "rows of operator (none of plannner: the panel has operator, planner)" in said
+    text = describe_run(prepare_new(tmp_path / "run", panel.path, None, misspelt))
+    assert "rows of operator (none of plannner: the panel has operator, planner)" in text
     # 2,000 updates of the critic; as many again for each 5,000 rows.
     assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
     fewer = prepare_new(

@@ -14,7 +14,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 ENVS, LONGEST = 3, 25
 
 
-def collecting(n_step: int) -> Collector:
+def make_collector(n_step: int) -> Collector:
     """Return a collector of short episodes that all go on to the time limit."""
     profile = load_profile("warehouse_amr")
     task = msgspec.structs.replace(profile.task, time_limit_steps=LONGEST, bump_terminates=False)
@@ -34,7 +34,7 @@ def collecting(n_step: int) -> Collector:
 
 def test_truncated_episodes_bootstrap_at_last_step():
     """The ring's rows of three steps against the single steps that the twin returned."""
-    made, rng = collecting(n_step=3), np.random.default_rng(0)
+    made, rng = make_collector(n_step=3), np.random.default_rng(0)
     step_of: dict[tuple[int, int], tuple[Any, ...]] = {}
     for number in range(2 * LONGEST):
         before, action = made.observation.copy(), rng.integers(0, 9, ENVS)
@@ -66,7 +66,7 @@ def test_truncated_episodes_bootstrap_at_last_step():
 
 
 def test_diverged_step_repeats_previous_row(monkeypatch):
-    made = collecting(n_step=1)
+    made = make_collector(n_step=1)
     simulation = made.env.simulation
     drive = simulation.drive
 

@@ -97,8 +97,8 @@ def test_shift_within_run_is_found() -> None:
     first, second = feed(1, runs=5), feed(2, runs=5)
     amounts = second.drawn.copy()
     for tenth, times in ((0, 1.5), (9, 0.5)):  # early more slip, late less
-        here = (second.tenth == tenth) & (second.cell == 1)
-        amounts[here] *= times
+        shifted_rows = (second.tenth == tenth) & (second.cell == 1)
+        amounts[shifted_rows] *= times
     shifted = Feed(
         CELLS, second.cell, second.tenth, second.episode, second.run, amounts, second.weight
     )

@@ -155,7 +155,7 @@ def test_invalid_arm_is_rejected(tmp_path, capsys) -> None:
     fed = pq.read_table(older / "sampled_episodes.parquet").drop_columns("condition")
     pq.write_table(fed, older / "sampled_episodes.parquet")
     older = str(older)
-    for words, said in (
+    for words, message in (
         ([*first], "needs two runs, got 3"),
         (["--against", *first], "needs the runs of the first method, too"),
         ([first[0], other, "--against", first[1]], "differs from"),
@@ -165,7 +165,7 @@ def test_invalid_arm_is_rejected(tmp_path, capsys) -> None:
         ([first[0], str(tmp_path)], "is not a run directory"),
     ):
         assert main(["compare", *words]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_dependent_seeds_are_rejected(tmp_path, capsys) -> None:
@@ -173,7 +173,7 @@ def test_dependent_seeds_are_rejected(tmp_path, capsys) -> None:
     second = arm(tmp_path, "b", range(2, 4), config__network__layer_norm=False)
     copied = str(shutil.copytree(first[0], tmp_path / "copied"))
     again = str(make_run(tmp_path / "again", document(1, created_ns=1)))
-    for words, said in (
+    for words, message in (
         ([*first, copied, "--against", *second], f"copied: is a copy of {first[0]}"),
         ([*first, again, "--against", *second], f"again: has the seed of {first[1]}, 1"),
         ([*first, "--against", first[1], again], f"again: has the seed of {first[1]}, 1"),
@@ -182,4 +182,4 @@ def test_dependent_seeds_are_rejected(tmp_path, capsys) -> None:
         ([first[0], first[0]], f"{first[0]}: is in both arms"),
     ):
         assert main(["compare", *words]) == 2
-        assert "".join(said.split()) in "".join(capsys.readouterr().err.split())
+        assert "".join(message.split()) in "".join(capsys.readouterr().err.split())

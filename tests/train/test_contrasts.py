@@ -29,7 +29,7 @@ name = "quotas"
 """
 
 
-def curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True) -> Path:
+def write_curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True) -> Path:
     """Return a finished run whose slipping missions succeed so often (tens) at each evaluation."""
     run = Run.create(path, document(seed))
     for step, share in success.items():
@@ -60,18 +60,18 @@ def test_area_lies_between_min_and_max(values: list[float], level: float) -> Non
 
 
 def test_partial_and_full_blocks_weigh_equally(tmp_path: Path) -> None:
-    run = RunCurve(curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}))
+    run = RunCurve(write_curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}))
     assert run.value("auc_blocked_aisle") == 0.5  # one partly blocked, three wholly
     assert run.value("auc_partly_blocked") == 0.0
     assert run.value("auc_rare") == pytest.approx((0.6 + 0.5) / 2)
     assert np.isnan(run.value("success_rare"))  # `restock eval` has not driven it
-    alone = RunCurve(curve(tmp_path / "b", 0, {0: 0.5, 100: 0.7}, full=False))
+    alone = RunCurve(write_curve(tmp_path / "b", 0, {0: 0.5, 100: 0.7}, full=False))
     assert alone.value("auc_blocked_aisle") == 0.0
 
 
 def test_curves_are_compared_over_common_steps(tmp_path: Path) -> None:
-    whole = RunCurve(curve(tmp_path / "a", 0, {0: 0.0, 100: 1.0, 200: 1.0}))
-    late = RunCurve(curve(tmp_path / "b", 0, {100: 0.5, 200: 0.5}))
+    whole = RunCurve(write_curve(tmp_path / "a", 0, {0: 0.0, 100: 1.0, 200: 1.0}))
+    late = RunCurve(write_curve(tmp_path / "b", 0, {100: 0.5, 200: 0.5}))
     found = contrast("a", "b", "auc_wheel_slip", [(whole, late)])
     assert found is not None
     assert (found.arm_mean, found.baseline_mean) == (1.0, 0.5)
@@ -80,24 +80,24 @@ def test_curves_are_compared_over_common_steps(tmp_path: Path) -> None:
     assert contrast("a", "b", "success_wheel_slip", [(whole, late)]) is None
 
 
-def study(tmp_path: Path, text: str = STUDY) -> StudyPlan:
+def make_plan(tmp_path: Path, text: str = STUDY) -> StudyPlan:
     (tmp_path / "s.toml").write_text(text)
     plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
     (tmp_path / "out" / "runs").mkdir(parents=True)
     return plan
 
 
-def finish(plan: StudyPlan, ahead: tuple[float, ...]) -> None:
+def finish_runs(plan: StudyPlan, ahead: tuple[float, ...]) -> None:
     for job in plan.jobs:
         more = ahead[job.seed] if job.arm.name == "quotas" else 0.0
         level = 0.3 + 0.1 * (job.seed % 2)
-        curve(job.path, job.seed, {0: level, 400: level + more})
+        write_curve(job.path, job.seed, {0: level, 400: level + more})
         job.done.write_text(plan.fingerprint(job))
 
 
 def test_holm_adjusts_all_but_primary_contrast(tmp_path: Path) -> None:
-    plan = study(tmp_path)
-    finish(plan, (0.2, 0.4, 0.4, 0.2))
+    plan = make_plan(tmp_path)
+    finish_runs(plan, (0.2, 0.4, 0.4, 0.2))
     first, *others = contrasts(plan, set())
     assert (first.primary, first.measure, first.pairs) == (True, "auc_wheel_slip", 4)
     assert first.difference == pytest.approx(0.15)
@@ -113,7 +113,7 @@ def test_holm_adjusts_all_but_primary_contrast(tmp_path: Path) -> None:
     assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
 
 
-def driven(policy: str, success: float, time_s: float) -> pa.Table:
+def evaluation_episodes(policy: str, success: float, time_s: float) -> pa.Table:
     rows: list[dict[str, object]] = []
     for condition, block in (("nominal", "none"), ("wheel_slip", "none")):
         for number in range(20):
@@ -128,14 +128,14 @@ def driven(policy: str, success: float, time_s: float) -> pa.Table:
 
 def test_study_page_lists_contrasts_and_safety(tmp_path: Path) -> None:
     text = STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]").replace("auc_wheel_slip", "success_rare")
-    plan = study(tmp_path, text)
+    plan = make_plan(tmp_path, text)
     for job in plan.jobs:
         level = 0.2 if job.arm.name == "uniform" else 0.7 + 0.05 * job.seed
         own = {} if job.arm.name == "uniform" else {"config__replay__logs_share": 0.9}
         make_run(job.path, document(job.seed, **own), success=level)
-        add_evaluation(job.path, driven("agent", level, 12.0))
+        add_evaluation(job.path, evaluation_episodes("agent", level, 12.0))
         job.done.write_text(plan.fingerprint(job))
-    add_evaluation(plan.jobs[0].path, driven("planner", 0.5, 10.0))
+    add_evaluation(plan.jobs[0].path, evaluation_episodes("planner", 0.5, 10.0))
     one, other = plan.study.arms
     found = findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
     primary = found["contrasts"][0]

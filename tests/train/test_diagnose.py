@@ -53,9 +53,9 @@ def make_run(
         lag = lags[window - 1] if lags else lag
         for name in CONDITIONS:
             share = (shares or SHARES).get(name, 0.0) if ill else SHARES[name]
-            here = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
+            gap_of_condition = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
             replay_td = 0.2 if share else None
-            unseen = 0.2 * (here if ill else 1.2)
+            unseen = 0.2 * (gap_of_condition if ill else 1.2)
             share_of = explained.get(name, 0.8) if isinstance(explained, Mapping) else explained
             append(
                 run, "evaluation_buffer", clocks, condition=name, explained=share_of,
@@ -134,9 +134,9 @@ def test_unrelated_runs_are_rejected(tmp_path, capsys) -> None:
     same_seed = str(make_run(tmp_path / "s", windows=3).path)
     recipe = str(make_run(tmp_path / "t", target=Hard(1000), seed=1).path)
     cases = {run: "is given twice", same_seed: "is a copy of", recipe: "in config.target"}
-    for other, said in cases.items():
+    for other, message in cases.items():
         assert main(["diagnose", run, other]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_diagnose_prints_cause_and_confirmation(
@@ -160,7 +160,7 @@ def test_undiagnosable_input_is_reported(tmp_path: Path, capsys: pytest.CaptureF
     progress = early.table("progress").drop(["q_abs_max"])
     none = pa.nulls(len(progress), pa.float64())
     pq.write_table(progress.append_column("q_abs_max", none), early.path / "progress.parquet")
-    for words, said in (
+    for words, message in (
         ([str(tmp_path / "young")], "has no evaluation to diagnose"),
         ([str(early.path)], "has no evaluation to diagnose"),
         ([str(tmp_path)], "is not a run, a panel or a store"),
@@ -170,7 +170,7 @@ def test_undiagnosable_input_is_reported(tmp_path: Path, capsys: pytest.CaptureF
         ([str(tmp_path / "well"), "--confirm", str(tmp_path / "c")], "there is nothing to confirm"),
     ):
         assert main(["diagnose", *words]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "c").exists()
 
 
@@ -193,9 +193,9 @@ def test_confirm_does_not_overwrite_a_run(tmp_path: Path, capsys) -> None:
     assert main(["diagnose", run, "--confirm", run]) == 2
     shown = capsys.readouterr()
     assert not shown.out  # refused before anything else
-    said = " ".join(shown.err.split())
-    assert "already exists give --confirm another directory" in said
-    assert "--out" not in said
+    error = " ".join(shown.err.split())
+    assert "already exists give --confirm another directory" in error
+    assert "--out" not in error
 
 
 @pytest.mark.parametrize("source", ["none", "planner"])

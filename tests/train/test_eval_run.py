@@ -34,13 +34,13 @@ def test_floor_is_evaluated_on_kinds_that_fit(tmp_path, capsys, shell):
     line = ["eval", str(run), "--layouts", str(hall), "--policies", "random", "--episodes", "1"]
     line += ["--perturbations", "none", "--json"]
     assert main(line) == 0
-    said = capsys.readouterr()
-    document = json.loads(said.out)
+    output = capsys.readouterr()
+    document = json.loads(output.out)
     kinds = [kind for kind in KINDS if kind != "blocked_aisle"]
     assert {row["condition"] for row in document["results"]} == set(kinds)
     assert document["kinds"] == kinds
     assert document["left_out"] == {"blocked_aisle": ["hall.toml"]}
-    assert "as there is no room for it on the floor 'hall.toml'" in said.err
+    assert "as there is no room for it on the floor 'hall.toml'" in output.err
     hall.write_text("width_m = 2.0\ndepth_m = 2.0\nracks = []\n")
     assert "has no room for episodes of nominal" in shell.err(*line)
 
@@ -48,9 +48,9 @@ def test_floor_is_evaluated_on_kinds_that_fit(tmp_path, capsys, shell):
 def test_zero_episodes_shows_recorded_evaluation(tmp_path, shell):
     run = kept_run(tmp_path / "a")
     line = ["eval", str(run), "--episodes", "0", "--json"]
-    said = " ".join(shell.err(*line).split())
-    assert "has no recorded evaluation" in said
-    assert f"run `restock eval {run}`" in said
+    error = " ".join(shell.err(*line).split())
+    assert "has no recorded evaluation" in error
+    assert f"run `restock eval {run}`" in error
     row = {"policy": "agent", "perturbation": "none", "condition": "nominal", "episode_seed": 3}
     row |= {"block": "none", "success": True, "return": 1.0, "bumps": 0, "time_s": 9.0}
     table = pa.Table.from_pylist([row], schema=EVAL_EPISODES)
@@ -78,9 +78,9 @@ def test_evaluations_accumulate_and_newest_is_shown(tmp_path, shell):
     add_evaluation(run, other)
     add_evaluation(run, replaced(other, {"version": "a@9"}))
     assert read_evaluations(run).num_rows == 5
-    shown, said = shown_evaluation(run)
+    shown, message = shown_evaluation(run)
     assert shown["version"].to_pylist() == ["a@9"]
-    assert said == (
+    assert message == (
         "1 of 5 episodes that `restock eval` drove: floors elsewhere, policy a@9 of step 0, seeds"
         " 1 to 1."
     )
@@ -113,21 +113,21 @@ def test_episodes_per_kind(tmp_path, shell):
     line = ["eval", str(run), "--policies", "agent", "--perturbations", "none", "--dry-run"]
     planned = json.loads(shell.out(*line, "--episodes", "nominal=1000, wheel_slip=300"))
     assert (planned["episodes"], planned["kinds"]) == (1300, ["nominal", "wheel_slip"])
-    for wrong, said in (
+    for wrong, message in (
         ("nominal=ten", "is neither a number nor kind=number"),
         ("ice=3", "there is no kind 'ice'"),
         ("nominal=0", "must be at least 1, got 0"),
         ("nominal=2,nominal=3", "names 'nominal' twice"),
     ):
-        assert said in " ".join(shell.err(*line, "--episodes", wrong).split())
+        assert message in " ".join(shell.err(*line, "--episodes", wrong).split())
 
 
 def test_seeds_that_selected_the_policy_are_warned_about(tmp_path: Path) -> None:
     run = kept_run(tmp_path / "a")  # its evaluation's seeds are 90000 to 90009
     assert plan_evaluation(run, episodes=1000).warnings == []
     assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []
-    (said,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
-    assert "among those that selected the run's policy (90000 to 90009)" in said
+    (text,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
+    assert "among those that selected the run's policy (90000 to 90009)" in text
 
 
 def test_limiter_interventions_are_counted(tmp_path, shell):
@@ -135,9 +135,9 @@ def test_limiter_interventions_are_counted(tmp_path, shell):
     limits.write_text("[limiter]\nmax_speed_mps = 0.5\n", encoding="utf-8")
     line = ["eval", str(run), "--policies", "planner", "--perturbations", "none", "--json"]
     line += ["--episodes", "nominal=2", "--limiter"]
-    said = json.loads(shell.out(*line, limits))
-    assert said["limiter"]["fastest"] == [0.5, 1.2]
-    free, limited = said["results"]
+    document = json.loads(shell.out(*line, limits))
+    assert document["limiter"]["fastest"] == [0.5, 1.2]
+    free, limited = document["results"]
     assert (free["policy"], free["limited_share"]) == ("planner", None)
     assert limited["policy"] == "limited:planner"
     assert 0 < limited["limited_share"] <= 1

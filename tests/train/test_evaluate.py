@@ -18,7 +18,7 @@ from restock.train.run.kept_evaluations import cell_name, measures, summary_rows
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
-class Always:
+class ConstantPolicy:
     """Takes one action, always."""
 
     name, version = "always", "1"
@@ -33,7 +33,7 @@ class Always:
 def drive(env: ToyTwin, action: int, specs: list[EpisodeSpec]) -> list[EpisodeResult]:
     return run_episodes(
         env,
-        Always(action),
+        ConstantPolicy(action),
         specs,
         control_period_s=TASK.control_period_s,
         time_limit_steps=TASK.time_limit_steps,
@@ -108,25 +108,27 @@ def test_summary_separates_partial_and_full_blocks() -> None:
     assert cell_name("nominal", "none") == "nominal"
 
 
-def drove(seed: int, success: bool, time_s: float, bumps: int = 0, **more: Any) -> EpisodeResult:
+def make_result(
+    seed: int, success: bool, time_s: float, bumps: int = 0, **more: Any
+) -> EpisodeResult:
     return EpisodeResult(
         "nominal", "none", seed, success, bumps, time_s, 1.0, 0.0, 0.0, None, **more
     )
 
 
-def came_to(results: list[EpisodeResult]) -> dict[str, Any]:
+def measure(results: list[EpisodeResult]) -> dict[str, Any]:
     return measures([{**one.row, "time_lost_s": None} for one in results])
 
 
 def test_bump_rate_is_per_kilometre() -> None:
-    far = drove(1, True, 30.0, distance_m=1500.0)
-    near = drove(2, False, 1.0, bumps=1, distance_m=500.0, closest_person_m=0.2)
-    row = came_to([far, near])
+    far = make_result(1, True, 30.0, distance_m=1500.0)
+    near = make_result(2, False, 1.0, bumps=1, distance_m=500.0, closest_person_m=0.2)
+    row = measure([far, near])
     assert row["bumps_per_km"] == pytest.approx(0.5)
     assert row["bumps_per_km_low"] <= 0.5 <= row["bumps_per_km_high"]
     assert (row["closest_person_least_m"], row["episodes_with_people"]) == (0.2, 1)
     # Two kilometres without a bump do not show that there will never be one.
-    clean = came_to([far, drove(3, True, 9.0, distance_m=500.0)])
+    clean = measure([far, make_result(3, True, 9.0, distance_m=500.0)])
     assert (clean["bumps_per_km"], clean["bumps_per_km_low"]) == (0.0, 0.0)
     assert clean["bumps_per_km_high"] == pytest.approx(3.689 / 2, abs=1e-3)
     assert clean["closest_person_m"] is None

@@ -71,10 +71,10 @@ def test_films_show_only_reproduced_episodes(run, shell):
             one["time_s"] += 1.0
     pq.write_table(table.from_pylist(rows, schema=table.schema), run / FILE)
     argv = ["eval", str(run), "--episodes", "0", "--video", "--policies", "agent", "--json"]
-    said = json.loads(shell.out(*argv))
-    assert [Path(path).name for path in said["films"]] == ["wheel_slip-worst.webp"]
-    assert said["not_filmed"] == ["blocked_aisle-worst: driven again it has another time_s"]
-    with Image.open(said["films"][0]) as film:
+    document = json.loads(shell.out(*argv))
+    assert [Path(path).name for path in document["films"]] == ["wheel_slip-worst.webp"]
+    assert document["not_filmed"] == ["blocked_aisle-worst: driven again it has another time_s"]
+    with Image.open(document["films"][0]) as film:
         assert getattr(film, "n_frames", 1) > 3
     facts = SimpleNamespace(run=run, missing=[])
     section = films_section(cast(Any, facts))

@@ -121,13 +121,13 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
     return build_panel(rows, parse_mixture(QUOTAS), path, task=TOY_TASK, conditions=TOY_CONDITIONS)
 
 
-def fed_by(panel: Panel, settings: Any = SETTINGS) -> Logs:
+def logs_of(panel: Panel, settings: Any = SETTINGS) -> Logs:
     return Logs.of_panel(panel, planned_draws(settings))
 
 
 def test_quotas_are_filled_from_logs_and_ring(panel: Panel, tmp_path: Path) -> None:
     """The logged rows bear a small part of the online draws: the ring gives the rest."""
-    live = run_to_end(tmp_path / "a", SETTINGS, logs=fed_by(panel))
+    live = run_to_end(tmp_path / "a", SETTINGS, logs=logs_of(panel))
     nominal, slip = [row for row in fed_shares(live.run) if row["stratum"] != "unlabelled"]
     assert nominal["wanted_share"] == slip["wanted_share"] == 0.5
     assert slip["drawn_share"] == pytest.approx(0.5, abs=0.05)
@@ -145,14 +145,14 @@ def test_quotas_are_filled_from_logs_and_ring(panel: Panel, tmp_path: Path) -> N
         )
         whole = sum(row["drawn_rows"] for row in table)
         assert drawn / whole == pytest.approx(slip[column])
-    audited = live.run.table("audit").to_pylist()
-    fresh = [row for row in audited if row["source"] == "fresh"]
+    audit = live.run.table("audit").to_pylist()
+    fresh = [row for row in audit if row["source"] == "fresh"]
     assert {row["stratum"] for row in fresh} >= {"nominal", "wheel_slip"}
     # Whole episodes: a row of the stratum need not slip itself.
     assert {row["condition"] for row in fresh if row["stratum"] == "wheel_slip"} >= {"nominal"}
 
 
-def audited(run: Path) -> list[dict[str, Any]]:
+def audit_effective_share(run: Path) -> list[dict[str, Any]]:
     (audit,) = [audit for audit in load_audits() if audit.name == "effective_share"]
     sql = audit.sql
     for name, value in load_thresholds()[audit.name].items():
@@ -181,13 +181,13 @@ def test_shortfall_is_reported_after_training(tmp_path: Path) -> None:
         schedule={"env_steps": 2400, "offline_updates": 4},
         env={"num_envs": 4, "conditions": {"nominal": 1.0, "wheel_slip": 0.0}},
     )
-    live = run_to_end(tmp_path / "a", nothing_slips, logs=fed_by(built, nothing_slips))
+    live = run_to_end(tmp_path / "a", nothing_slips, logs=logs_of(built, nothing_slips))
     fed = fed_shares(live.run)
-    (said,) = shortfalls(fed)
-    assert said.startswith("wheel_slip was ")
-    assert "less than half of its quota of 50.0%" in said
-    assert "the ring has too few fresh rows of it" in said
-    (row,) = [row for row in audited(live.run.path) if row["source"] == "batch"]
+    (message,) = shortfalls(fed)
+    assert message.startswith("wheel_slip was ")
+    assert "less than half of its quota of 50.0%" in message
+    assert "the ring has too few fresh rows of it" in message
+    (row,) = [row for row in audit_effective_share(live.run.path) if row["source"] == "batch"]
     assert row["stratum"] == "wheel_slip"
     assert row["drawn_share"] < 0.5 * row["wanted_share"]
 
@@ -217,7 +217,7 @@ def test_seconds_budget_uses_measured_speed(panel, tmp_path):
     settings = config(
         replay={"logs_share": None}, schedule={"seconds": 100.0, "env_steps": 10_000_000}
     )
-    live = session(tmp_path / "a", settings, logs=fed_by(panel, settings))
+    live = session(tmp_path / "a", settings, logs=logs_of(panel, settings))
     assert live.progress.planned_env_steps == 80_000  # a first guess
     live.progress.wall_s, live.progress.online_from_s = 60.0, 20.0
     live.progress.driving_from_s, live.progress.online_from = 10.0, 200
@@ -231,7 +231,7 @@ def test_seconds_budget_uses_measured_speed(panel, tmp_path):
     live.collector.reset(0)
     live.save()
     live.close()
-    again = session(tmp_path / "a", settings, logs=fed_by(panel, settings), resume=True)
+    again = session(tmp_path / "a", settings, logs=logs_of(panel, settings), resume=True)
     assert again.progress.planned_env_steps == live.progress.planned_env_steps
     assert again.batches.controller is not None
     assert again.batches.controller.planned == live.batches.controller.planned

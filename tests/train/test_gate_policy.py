@@ -27,7 +27,7 @@ def run(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[[Outcome], None]:
+def drive_outcomes(monkeypatch: pytest.MonkeyPatch) -> Callable[[Outcome], None]:
     """Let the twin's episodes end as a function says."""
 
     def install(outcome: Outcome) -> None:
@@ -48,17 +48,19 @@ def result(spec: EpisodeSpec, success: bool) -> EpisodeResult:
     return EpisodeResult(spec.condition, block, spec.seed, *outcome, distance_m=30.0)
 
 
-def often(spec: EpisodeSpec, own: bool) -> bool:
+def mostly_successful(spec: EpisodeSpec, own: bool) -> bool:
     """Nine of ten missions succeed, by either."""
     return bool(np.random.default_rng(spec.seed).random() < 0.9)
 
 
-def spoilt(spec: EpisodeSpec, own: bool) -> bool:
-    return often(spec, own) and not (own and spec.condition == "wheel_slip" and spec.seed % 2)
+def failing_in_slip(spec: EpisodeSpec, own: bool) -> bool:
+    return mostly_successful(spec, own) and not (
+        own and spec.condition == "wheel_slip" and spec.seed % 2
+    )
 
 
-def test_equal_policies_pass_before_budget_is_spent(run: Path, driven: Any) -> None:
-    driven(often)
+def test_equal_policies_pass_before_budget_is_spent(run: Path, drive_outcomes: Any) -> None:
+    drive_outcomes(mostly_successful)
     assert main(["gate", str(run), "--baseline", "planner"]) == 0
     document = json.loads((run / "gate" / "gate.json").read_text())
     assert document["verdict"] == NOT_WORSE
@@ -74,8 +76,8 @@ def test_equal_policies_pass_before_budget_is_spent(run: Path, driven: Any) -> N
     assert "was not measured" in page  # the twin's gap
 
 
-def test_worse_condition_is_named(run, driven, shell):
-    driven(spoilt)
+def test_worse_condition_is_named(run, drive_outcomes, shell):
+    drive_outcomes(failing_in_slip)
     document = shell.json("gate", run, "--baseline", "planner", code=1)
     verdicts = {cell["condition"]: cell["verdict"] for cell in document["cells"]}
     assert document["verdict"] == WORSE
@@ -83,8 +85,8 @@ def test_worse_condition_is_named(run, driven, shell):
     assert "worse in wheel slip" in document["claim"]
 
 
-def test_spent_budget_is_inconclusive(run: Path, driven: Any) -> None:
-    driven(
+def test_spent_budget_is_inconclusive(run: Path, drive_outcomes: Any) -> None:
+    drive_outcomes(
         lambda spec, own: bool(
             np.random.default_rng(2 * spec.seed + own).random() < 0.6 - 0.1 * own
         )
@@ -96,9 +98,9 @@ def test_spent_budget_is_inconclusive(run: Path, driven: Any) -> None:
     assert 160 <= cell["pairs"] < 160 + gate.ROUND
 
 
-def test_each_requested_measure_gets_a_verdict(run: Path, driven: Any) -> None:
+def test_each_requested_measure_gets_a_verdict(run: Path, drive_outcomes: Any) -> None:
     """A policy that arrives as often but bumps more fails by bumps alone."""
-    driven(often)
+    drive_outcomes(mostly_successful)
     margins = {"bumps_per_km": 5.0, "time_lost_s": 2.0, "closest_person_m": 0.2}
     plan = plan_gate(run, "planner", margins=margins, conditions=("nominal",), budget=400)
     cells = {cell["measure"]: cell for cell in drive_gate(plan)["cells"]}

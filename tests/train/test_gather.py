@@ -20,7 +20,7 @@ TABLES = npst.arrays(
 
 
 @pytest.fixture(autouse=True, params=[True, False], ids=["compiled", "not compiled"])
-def way(request: pytest.FixtureRequest) -> Iterator[None]:
+def use_native(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.param and not native.IS_USED:
         pytest.skip(f"native code is {native.state()}")
     with pytest.MonkeyPatch.context() as patch:
@@ -28,7 +28,7 @@ def way(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
+def rows_match(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
     return np.array_equal(given.numpy(), rows.numpy()[index.numpy()], equal_nan=True)
 
 
@@ -40,7 +40,7 @@ def test_rows_are_gathered_in_order(table: np.ndarray, data: st.DataObject) -> N
     index = torch.tensor(numbers, dtype=torch.int64)
     given = gather_rows(rows, index)
     assert given.shape == (len(numbers), table.shape[1])
-    assert same(given, rows, index)
+    assert rows_match(given, rows, index)
 
 
 def test_gather_preserves_bits() -> None:
@@ -67,4 +67,4 @@ def test_row_out_of_range_is_rejected(number: int) -> None:
 )
 def test_gather_accepts_other_dtypes_and_strides(rows: torch.Tensor) -> None:
     index = torch.tensor([3, 3, 0])
-    assert same(gather_rows(rows, index), rows, index)
+    assert rows_match(gather_rows(rows, index), rows, index)

@@ -19,7 +19,7 @@ from restock.train.run.run import PolicyOrigin, Run, kept_policy
 from restock.train.session import Session
 
 
-def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
+def train_until(live: Session, stop: Callable[[], bool]) -> Session:
     with pytest.raises(TrainingInterrupted):
         train(live, stop=stop)
     live.close()
@@ -29,7 +29,7 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
 def test_run_interrupted_before_evaluation_keeps_latest(tmp_path):
     """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
     live = session(tmp_path / "a", config())
-    interrupted(live, lambda: live.progress.env_steps >= 700)
+    train_until(live, lambda: live.progress.env_steps >= 700)
     run = Run.open(live.run.path)
     assert run.best.is_file()
     assert kept_policy(run) == PolicyOrigin("latest", 700, live.learner.gradient_steps, 700)
@@ -54,7 +54,7 @@ def test_interruption_before_online_learning(phase, chosen, step, tmp_path):
             return live.learner.gradient_steps >= 20
         return live.progress.env_steps >= 100
 
-    interrupted(live, stop)
+    train_until(live, stop)
     now = kept_policy(Run.open(live.run.path))
     assert now is not None
     assert (now.chosen, now.env_steps) == (chosen, step)
@@ -63,7 +63,7 @@ def test_interruption_before_online_learning(phase, chosen, step, tmp_path):
 
 def test_evaluation_after_last_checkpoint_counts(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config())
-    interrupted(live, lambda: live.progress.env_steps >= 700)
+    train_until(live, lambda: live.progress.env_steps >= 700)
     before = live.run.latest.read_bytes()
     resumed = session(live.run.path, config(), resume=True)
     train(resumed)
@@ -84,7 +84,7 @@ def test_reports_name_the_driven_policy(tmp_path, shell):
         "record.trackers=[]",
     ]
     live = prepare_new(path, None, None, settings).open()
-    interrupted(live, lambda: live.progress.env_steps >= 60)
+    train_until(live, lambda: live.progress.env_steps >= 60)
     loaded = load_agent(Run.open(path))
     for name, weights in live.learner.policy.state_dict().items():
         assert torch.equal(loaded.network.state_dict()[name], weights), name
@@ -120,15 +120,15 @@ def test_reports_name_the_driven_policy(tmp_path, shell):
         headline(facts)
     )
     assert main([*line, "--policies", "agent"]) == 0
-    said = headline(gather(path))
-    assert said.endswith(step.text) == (step.env_steps < 160)
-    assert "step 60" not in said
+    message = headline(gather(path))
+    assert message.endswith(step.text) == (step.env_steps < 160)
+    assert "step 60" not in message
 
 
 def test_run_stopped_before_first_update_has_no_policy(tmp_path: Path) -> None:
     changes: dict[str, Any] = {"schedule": {"warmup_env_steps": 400}}
     live = session(tmp_path / "a", config(**changes), logs=None)
-    interrupted(live, lambda: live.progress.env_steps >= 100)
+    train_until(live, lambda: live.progress.env_steps >= 100)
     run = Run.open(live.run.path)
     assert kept_policy(run) is None
     with pytest.raises(RunError, match="stopped before its first update"):

@@ -77,7 +77,7 @@ def test_half_of_seconds_budget_is_online(tmp_path: Path, monkeypatch: pytest.Mo
     assert live.progress.planned_env_steps < 10**6
 
 
-class AtOnce(Executor):
+class ImmediateExecutor(Executor):
     """An executor that runs what it is given, in the thread that gives it."""
 
     def submit(self, work: Any, /, *args: Any, **named: Any) -> Future[Any]:
@@ -87,7 +87,7 @@ class AtOnce(Executor):
 
 
 def test_simulation_thread_does_not_change_results(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr("restock.train.session.ThreadPoolExecutor", lambda *_: AtOnce())
+    monkeypatch.setattr("restock.train.session.ThreadPoolExecutor", lambda *_: ImmediateExecutor())
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config()))
 
 
@@ -125,13 +125,13 @@ def test_half_of_online_batch_is_logged_by_quota(undisturbed: Session) -> None:
     assert {row["source"] for row in offline} == {"logs"}
     online = [row for row in strata if row["phase"] == "online"]
     for clock in {row["gradient_steps"] for row in online}:
-        here = [row for row in online if row["gradient_steps"] == clock]
+        interval = [row for row in online if row["gradient_steps"] == clock]
         drawn = {
-            source: sum(row["drawn_rows"] for row in here if row["source"] == source)
+            source: sum(row["drawn_rows"] for row in interval if row["source"] == source)
             for source in ("logs", "fresh")
         }
         assert drawn["logs"] == drawn["fresh"] > 0
-        slip = next(r for r in here if r["source"] == "logs" and r["stratum"] == "wheel_slip")
+        slip = next(r for r in interval if r["source"] == "logs" and r["stratum"] == "wheel_slip")
         assert slip["drawn_share"] == pytest.approx(0.25, abs=1e-3)
         assert slip["quota_share"] == 0.25
         assert slip["timing"] == "post"
@@ -266,28 +266,29 @@ def test_best_checkpoint_has_best_evaluation(undisturbed: Session) -> None:
 def test_warmup_collects_without_learning(tmp_path):
     settings = config(schedule={"env_steps": 400, "warmup_env_steps": 400})
     live = session(tmp_path / "a", settings, logs=None)
-    said = no_update(train(live), settings)
+    text = no_update(train(live), settings)
     live.close()
     assert live.learner.gradient_steps == 0
     assert len(live.ring) > 300
-    assert said is not None
-    assert said.startswith("no update was made in 400 environment steps")
-    assert "schedule.warmup_env_steps=400" in said
+    assert text is not None
+    assert text.startswith("no update was made in 400 environment steps")
+    assert "schedule.warmup_env_steps=400" in text
 
 
 def test_resume_reports_spent_budget(undisturbed: Session, tmp_path: Path) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
 
-    def said(**schedule: Any) -> str:
+    def idle_reason(**schedule: Any) -> str:
         live = session(path, config(schedule=schedule), resume=True)
         live.close()
         return nothing_to_do(live) or "goes on"
 
     assert (
-        said() == "its budget of 1,600 environment steps is used up; give more with --env-steps N"
+        idle_reason()
+        == "its budget of 1,600 environment steps is used up; give more with --env-steps N"
     )
-    assert said(env_steps=2000) == "goes on"
-    used_up = said(env_steps=2000, seconds=1e-9)
+    assert idle_reason(env_steps=2000) == "goes on"
+    used_up = idle_reason(env_steps=2000, seconds=1e-9)
     assert used_up == "its budget of 1e-09 s is used up; give more with --seconds S"
     undisturbed.progress.evaluated_at, before = 800, undisturbed.progress.evaluated_at
     assert nothing_to_do(undisturbed) is None  # its last evaluation was abandoned

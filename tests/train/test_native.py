@@ -33,7 +33,7 @@ def network(hidden: tuple[int, ...], layer_norm: bool) -> QNetwork:
     return made
 
 
-def made_native(held: QNetwork, *, wide: bool = True) -> Kernel:
+def make_kernel(held: QNetwork, *, wide: bool = True) -> Kernel:
     flat = FlatParameters(held, learns=True)
     return Kernel(held, flat.values, flat.gradient, wide=wide)
 
@@ -47,7 +47,7 @@ def test_values_and_gradients_match_autograd(hidden, layer_norm, batch):
     held = network(hidden, layer_norm)
     exact = clone(held).double().requires_grad_()
     narrow = clone(held)
-    both = [(held, made_native(held)), (narrow, made_native(narrow, wide=False))]
+    both = [(held, make_kernel(held)), (narrow, make_kernel(narrow, wide=False))]
     packed = normal(batch, 2 * OBSERVATION + 3, seed=1)  # observations are slices of wider rows
     now, after = packed[:, :OBSERVATION], packed[:, OBSERVATION : 2 * OBSERVATION]
     for seed in (2, 3):  # twice: nothing of the first pass is left in the second
@@ -176,7 +176,7 @@ def test_gradients_of_two_forward_passes_add_up() -> None:
     """As autograd does: gradients of two passes are added, in any order."""
     held = network((16, 16), layer_norm=True)
     theirs = clone(held).requires_grad_()
-    ours = made_native(held)
+    ours = make_kernel(held)
     first, second = normal(5, OBSERVATION, seed=1), normal(9, OBSERVATION, seed=2)
     (ours(first).square().mean() + ours(second).square().mean()).backward()
     (theirs(first).square().mean() + theirs(second).square().mean()).backward()

@@ -47,9 +47,9 @@ def test_changed_panel_byte_is_rejected_before_training(panel, tmp_path, shell):
         at = 6003  # the exponent of a number between two of the blocks that every opening looks at
         rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
         for argv in (["--dry-run"], []):
-            said = shell.err("train", "--panel", panel, "--out", out, *TINY, *argv)
-            assert f"{rows}: its checksum is" in said
-            assert "make it again with `restock mix`" in said
+            error = shell.err("train", "--panel", panel, "--out", out, *TINY, *argv)
+            assert f"{rows}: its checksum is" in error
+            assert "make it again with `restock mix`" in error
             assert not out.exists()
     finally:
         rows.write_bytes(whole)
@@ -69,11 +69,11 @@ def test_changed_panel_byte_is_rejected_before_training(panel, tmp_path, shell):
 def test_nonfinite_loss_exits_with_code_2(panel, tmp_path, shell):
     out = tmp_path / "run"
     argv = ["train", "--panel", str(panel), "--out", str(out), *TINY]
-    said = shell.err(*argv, "--set", "optimizer.learning_rate=1e30")
-    assert f"{out}: the loss is " in said
-    assert "panel row" in said
-    assert "lower optimizer.learning_rate" in said
-    assert "Traceback" not in said
+    error = shell.err(*argv, "--set", "optimizer.learning_rate=1e30")
+    assert f"{out}: the loss is " in error
+    assert "panel row" in error
+    assert "lower optimizer.learning_rate" in error
+    assert "Traceback" not in error
     stopped = json.loads((out / STOPPED).read_text())
     assert len(stopped["rows"]) == len(stopped["rows_before"]) == 32
     Run.open(out)  # every table is there

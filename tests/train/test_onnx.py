@@ -61,13 +61,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_onnx_file_describes_its_inputs(run: Path, tmp_path: Path, shell: Shell) -> None:
     out = tmp_path / "p.onnx"
-    said = shell.json("export", run, "--to", "onnx", "--out", out)
+    document = shell.json("export", run, "--to", "onnx", "--out", out)
     assert onnx.load(out).ir_version == 8  # the first with opset 18; ONNX Runtime 1.16 reads 9
     session = runtime.InferenceSession(str(out))
     meta = session.get_modelmeta().custom_metadata_map
     assert json.loads(meta["actions"]) == [list(action) for action in TASK.actions]
     assert json.loads(meta["observation"]) == TASK.observation_names
-    assert meta["task_hash"] == said["task_hash"] == TASK.hash
+    assert meta["task_hash"] == document["task_hash"] == TASK.hash
     assert msgspec.json.decode(meta["task"], type=type(TASK)) == TASK
     assert meta["version"] == "a@7"
 
@@ -93,9 +93,9 @@ def test_eval_of_onnx_policy_matches_agent(run: Path, tmp_path: Path, shell: She
 def test_export_into_store_or_other_run_is_rejected(run, tmp_path, shell):
     store = write_store(tmp_path / "store", [recording_transitions(1)])
     other = kept_run(tmp_path / "other")
-    for place, said in ((store, "the store"), (other, "the run")):
+    for place, message in ((store, "the store"), (other, "the run")):
         out = place / "p.onnx"
-        assert f"is within {said} {place}:" in " ".join(
+        assert f"is within {message} {place}:" in " ".join(
             shell.err("export", run, "--to", "onnx", "--out", out).split()
         )
         assert not out.exists()
@@ -110,13 +110,13 @@ def test_invalid_onnx_policy_is_rejected(run: Path, tmp_path: Path, shell: Shell
     (tmp_path / "text.onnx").write_text("hello")
     other = DQN(LossConfig()).make_network(NetworkConfig(hidden=(4,)), 3, 2)
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())
-    for name, said in (
+    for name, message in (
         ("missing.onnx", "no such file"),
         (".", r"is a folder, not an ONNX file\n.*restock export"),
         ("text.onnx", r"is not an ONNX model.*\n.*restock export"),
         ("other.onnx", r"the task's observation is \(N, "),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             OnnxPolicy(tmp_path / name, TASK)
     changed = msgspec.structs.replace(TASK, time_limit_steps=7)
     with pytest.raises(ConfigError, match="was made for task"):
@@ -129,8 +129,8 @@ def test_eval_reads_perturbation_file(run: Path, tmp_path: Path, shell: Shell) -
     wet = tmp_path / "wet.toml"
     wet.write_text('name = "wet"\nfriction_scale = 0.5\n')
     argv = ["eval", str(run), "--dry-run", "--json", "--perturbations"]
-    said = json.loads(shell.out(*argv, f"none,{wet}"))["perturbations"]
-    assert {name: table["friction_scale"] for name, table in said.items()} == {
+    document = json.loads(shell.out(*argv, f"none,{wet}"))["perturbations"]
+    assert {name: table["friction_scale"] for name, table in document.items()} == {
         "none": 1.0,
         str(wet): 0.5,
     }

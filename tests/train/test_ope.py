@@ -124,7 +124,7 @@ def test_weights_fall_back_to_cloned_probabilities(panel):
     unknown = np.isnan(dataset.evaluation.probability)
     assert 0 < unknown.mean() < 1
     assert {row["estimated_share"] for row in rows} == {unknown.mean()}
-    logged = _known(dataset.evaluation)
+    logged = _with_known_probability(dataset.evaluation)
     rows = evaluate_off_policy(
         network,
         replace(dataset, evaluation=logged),
@@ -142,7 +142,7 @@ def test_weights_fall_back_to_cloned_probabilities(panel):
     assert whole["value"] == pytest.approx(total, rel=1e-5)
 
 
-def _known(steps: OpeSteps) -> OpeSteps:
+def _with_known_probability(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
@@ -157,14 +157,14 @@ def test_eval_on_logs_reports_values_and_refusals(
     assert (requested["episodes"], requested["measures"]) == (9, ["return", "success"])
     assert "results" not in requested
     assert main(argv) == 0
-    said = capsys.readouterr()
-    assert f"on 9 episodes ({requested['rows']} rows): {requested['updates']} updates" in said.err
-    assert "refused" in said.out
-    assert "episodes, less than" in " ".join(said.err.split())
-    assert "are estimated (cloned) for" in " ".join(said.err.split())
+    output = capsys.readouterr()
+    assert f"on 9 episodes ({requested['rows']} rows): {requested['updates']} updates" in output.err
+    assert "refused" in output.out
+    assert "episodes, less than" in " ".join(output.err.split())
+    assert "are estimated (cloned) for" in " ".join(output.err.split())
     # The quick models make 2 regressions, so they see less than the task's 240 steps.
     reach = "looks 2 steps ahead, but an episode may take 240 (9 of 9 held-out episodes are longer)"
-    assert reach in " ".join(said.err.split())
+    assert reach in " ".join(output.err.split())
     rows = shell.json(*argv)["results"]
     table = pq.read_table(run / "eval" / "off_policy.parquet").to_pylist()
     assert [row["value"] for row in table] == [row["value"] for row in rows]
@@ -185,5 +185,5 @@ def test_training_runs_off_policy_evaluation_first(panel, tmp_path, quick_models
     rows = pq.read_table(path / "off_policy.parquet").to_pylist()
     assert {row["measure"] for row in rows} == {"return", "success"}
     assert {row["gradient_steps"] for row in rows} == {3}
-    said = " ".join(capsys.readouterr().err.split())  # as `restock eval --on-logs` does
-    assert "off-policy evaluation: the fitted model looks 2 steps ahead" in said
+    error = " ".join(capsys.readouterr().err.split())  # as `restock eval --on-logs` does
+    assert "off-policy evaluation: the fitted model looks 2 steps ahead" in error

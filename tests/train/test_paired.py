@@ -15,7 +15,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle")
 
 
-def evaluated(
+def evaluated_run(
     path: Path,
     success: dict[str, float],
     *,
@@ -60,7 +60,7 @@ GOOD = {"nominal": 1.0, "wheel_slip": 0.6, "blocked_aisle": 0.5}
 
 @pytest.fixture
 def baseline(tmp_path: Path) -> Path:
-    return evaluated(tmp_path / "good", GOOD)
+    return evaluated_run(tmp_path / "good", GOOD)
 
 
 def verdicts(rows: list[dict[str, object]], perturbation: str = "none") -> dict[object, object]:
@@ -75,7 +75,7 @@ def compared(first: Path, second: Path) -> list[dict[str, Any]]:
 
 
 def test_paired_verdicts_per_condition(baseline: Path, tmp_path: Path) -> None:
-    other = evaluated(
+    other = evaluated_run(
         tmp_path / "b", {"nominal": 1.0, "wheel_slip": 0.2, "blocked_aisle": 0.9}, shuffle=3
     )
     rows = compared(baseline, other)
@@ -93,15 +93,15 @@ def test_paired_verdicts_per_condition(baseline: Path, tmp_path: Path) -> None:
 
 def test_pairing_detects_small_drop(tmp_path: Path) -> None:
     """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
-    first = evaluated(tmp_path / "a", GOOD)
-    second = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
+    first = evaluated_run(tmp_path / "a", GOOD)
+    second = evaluated_run(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
     assert verdicts(compared(first, second))["wheel_slip"] == "worse"
 
 
 def test_few_episodes_are_inconclusive(tmp_path: Path) -> None:
     """One episode that fell is no regression: values, without interval and verdict."""
-    good = evaluated(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
-    bad = evaluated(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
+    good = evaluated_run(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
+    bad = evaluated_run(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
     rows = compared(good, bad)
     few = {row["condition"]: row for row in rows if row["perturbation"] == "none"}
     assert {few[name]["verdict"] for name in ("nominal", "wheel_slip")} == {"inconclusive"}
@@ -119,6 +119,6 @@ def test_few_episodes_are_inconclusive(tmp_path: Path) -> None:
     ids=str,
 )
 def test_only_common_episodes_are_compared(baseline, tmp_path, changes, episodes) -> None:
-    rows = compared(baseline, evaluated(tmp_path / "b", GOOD, **changes))
+    rows = compared(baseline, evaluated_run(tmp_path / "b", GOOD, **changes))
     nominal = [row for row in rows if row["condition"] == "nominal"]
     assert {row["perturbation"]: row["episodes"] for row in nominal} == episodes

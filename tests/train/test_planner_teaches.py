@@ -32,7 +32,7 @@ TASK = load_profile("warehouse_amr").task
 KNOWN = TASK.observation_names.index("nav_known")
 
 
-def observed(command: np.ndarray, known: np.ndarray) -> np.ndarray:
+def observations_of(command: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Observations (N, D) with these proposed commands (N, 2), in m/s and rad/s."""
     rng = np.random.default_rng(0)
     observation = rng.normal(size=(len(command), TASK.observation_size)).astype(np.float32)
@@ -46,7 +46,7 @@ def test_proposal_reader_returns_nearest_action(seed: int) -> None:
     rng = np.random.default_rng(seed)
     command, known = rng.uniform(-1.2, 1.2, (50, 2)), rng.random(50) < 0.7
     near, offset, says = proposal_reader(TASK)
-    observation = observed(command, known)
+    observation = observations_of(command, known)
     found = (observation @ near.T + offset).argmax(axis=1)
     wanted, _ = nearest_action(TASK, command[:, 0], command[:, 1])
     assert (found == wanted)[known].all()
@@ -59,7 +59,7 @@ def learner(margin: float, *, path: str | None = None) -> Learner:
     return make_learner(parse_config(document, where="test"), TASK, path=path)
 
 
-def values(one: Learner, q: list[float]) -> None:
+def set_q(one: Learner, q: list[float]) -> None:
     """Let Q be `q` (A,) in every state."""
     for network in (one.network, one.target_network, one.policy_network):
         with torch.no_grad():
@@ -70,21 +70,21 @@ def values(one: Learner, q: list[float]) -> None:
 def test_policy_deviates_only_beyond_the_margin() -> None:
     one = learner(0.3)
     command = np.asarray(TASK.actions)  # each action is proposed once
-    observation = observed(command, np.ones(len(command), np.bool_))
-    values(one, [0.0, 0.25, *[0.0] * (len(command) - 2)])
+    observation = observations_of(command, np.ones(len(command), np.bool_))
+    set_q(one, [0.0, 0.25, *[0.0] * (len(command) - 2)])
     assert one.greedy(observation).tolist() == list(range(len(command)))
-    values(one, [0.0, 0.35, *[0.0] * (len(command) - 2)])
+    set_q(one, [0.0, 0.35, *[0.0] * (len(command) - 2)])
     assert one.greedy(observation).tolist() == [1] * len(command)
-    values(one, [0.0, 0.05, *[0.0] * (len(command) - 2)])
-    unknown = observed(command, np.zeros(len(command), np.bool_))
+    set_q(one, [0.0, 0.05, *[0.0] * (len(command) - 2)])
+    unknown = observations_of(command, np.zeros(len(command), np.bool_))
     assert one.greedy(unknown).tolist() == [1] * len(command)  # nothing is proposed: Q alone
 
 
 @pytest.mark.parametrize("path", ["native", "autograd"])
 def test_td_target_uses_action_of_filtered_policy(path: str) -> None:
     one = learner(0.3, path=path)
-    values(one, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
-    after = observed(np.array([[0.0, 0.0], TASK.actions[2]]), np.ones(2, np.bool_))
+    set_q(one, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
+    after = observations_of(np.array([[0.0, 0.0], TASK.actions[2]]), np.ones(2, np.bool_))
     scalars = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]], np.float32)
     rows = torch.from_numpy(np.concatenate([after, after, scalars], axis=1))
     td, _, _ = one.td_error(rows)
@@ -94,7 +94,7 @@ def test_td_target_uses_action_of_filtered_policy(path: str) -> None:
 
 def test_constant_q_follows_the_planner() -> None:
     one = learner(0.3)
-    values(one, [0.0] * len(TASK.actions))
+    set_q(one, [0.0] * len(TASK.actions))
     env = WarehouseVectorEnv(8, seed=3)
     observation, _ = env.reset(seed=3)
     planner = PlannerFollower(epsilon=0.0)
@@ -108,7 +108,7 @@ def test_constant_q_follows_the_planner() -> None:
     assert len(set(taken)) > 3
 
 
-def kept(path, seed, **teacher):
+def make_kept_run(path, seed, **teacher):
     """Write a run with a policy of random weights; return the policy."""
     document = {"teacher": teacher, "network": {"hidden": [16]}, "seed": seed}
     config = parse_config(document, where="test")
@@ -123,7 +123,7 @@ def kept(path, seed, **teacher):
 
 def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None:
     one, other = (
-        kept(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
+        make_kept_run(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
         for seed, name in enumerate("ab")
     )
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
@@ -131,7 +131,7 @@ def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None
     run = Run.open(tmp_path / "mean")
     assert run.document["created_ns"] > 1  # it is newer than what it is the mean of
     made = load_agent(run)
-    observation = torch.from_numpy(observed(np.asarray(TASK.actions), np.arange(10) > 4))
+    observation = torch.from_numpy(observations_of(np.asarray(TASK.actions), np.arange(10) > 4))
     with torch.no_grad():
         mean = (one.network.values(observation) + other.network.values(observation)) / 2
         torch.testing.assert_close(made.network.values(observation), mean)
@@ -143,12 +143,12 @@ def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None
 def test_mean_of_means_averages_logits(tmp_path: Path) -> None:
     places = [tmp_path / name for name in "abcd"]
     filters = {"source": "operator", "ratio": 0.9}
-    alone = [kept(place, seed, **filters).network for seed, place in enumerate(places)]
+    alone = [make_kept_run(place, seed, **filters).network for seed, place in enumerate(places)]
     pairs = [tmp_path / "ab", tmp_path / "cd"]
     for first, pair in zip((0, 2), pairs, strict=True):
         write_mean(places[first : first + 2], pair)
     made = write_mean(pairs, tmp_path / "all").network
-    observation = torch.from_numpy(observed(np.asarray(TASK.actions), np.arange(10) > 4))
+    observation = torch.from_numpy(observations_of(np.asarray(TASK.actions), np.arange(10) > 4))
     with torch.no_grad():
         logits = sum(one.behaviour(observation) for one in alone) / 4
         mean = sum(one.values(observation) for one in alone) / 4
@@ -164,9 +164,9 @@ def test_mean_of_means_averages_logits(tmp_path: Path) -> None:
 def test_runs_that_cannot_be_averaged_are_rejected(
     tmp_path: Path, teacher, why: str, shell: Shell
 ) -> None:
-    kept(tmp_path / "runs" / "a", 0, source="planner")
+    make_kept_run(tmp_path / "runs" / "a", 0, source="planner")
     if teacher:
-        kept(tmp_path / "runs" / "b", 1, source=teacher)
+        make_kept_run(tmp_path / "runs" / "b", 1, source=teacher)
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
     assert why in shell.err(*words)
     assert not (tmp_path / "mean").exists()

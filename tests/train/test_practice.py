@@ -33,7 +33,9 @@ ARMS = [
 ]
 
 
-def ended(kind: str, success: bool, count: int = 1, block: str = "none") -> list[EndedEpisode]:
+def ended_episodes(
+    kind: str, success: bool, count: int = 1, block: str = "none"
+) -> list[EndedEpisode]:
     one = EndedEpisode(*(0, 0, 0, 0, 0, "nominal", kind, block, 0.0, success, 0, 1), signals={})
     return [one] * count
 
@@ -42,7 +44,7 @@ def practice(rule: str) -> Practice:
     return Practice(PracticeConfig(rule=rule), ARMS)
 
 
-def at(env_steps: int) -> dict[str, int]:
+def clocks_at(env_steps: int) -> dict[str, int]:
     return {"env_steps": env_steps, "gradient_steps": 0}
 
 
@@ -70,9 +72,9 @@ def test_success_rule_favours_failing_arms(monkeypatch):
     monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
     found = practice(rule="success")
     np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
-    found.note(ended("nominal", True, 50) + ended("wheel_slip", False, 50))
-    found.note(ended("blocked_aisle", True, 3, "partial"))  # too few to be believed
-    rows = found.advance(at(1000))
+    found.note(ended_episodes("nominal", True, 50) + ended_episodes("wheel_slip", False, 50))
+    found.note(ended_episodes("blocked_aisle", True, 3, "partial"))  # too few to be believed
+    rows = found.advance(clocks_at(1000))
     np.testing.assert_allclose(found.shares.sum(), 1.0)
     nominal, slip, partial, full = found.shares
     assert nominal == pytest.approx(FLOOR)
@@ -85,8 +87,8 @@ def test_success_rule_favours_failing_arms(monkeypatch):
 
 def test_arm_with_few_missions_uses_rate_of_its_kind() -> None:
     found = practice(rule="success")
-    found.note(ended("blocked_aisle", True, 6, "partial"))
-    found.note(ended("blocked_aisle", False, 1, "full"))
+    found.note(ended_episodes("blocked_aisle", True, 6, "partial"))
+    found.note(ended_episodes("blocked_aisle", False, 1, "full"))
     rates = found.failure_rate
     assert rates[2] == pytest.approx(0.5 / 7, abs=0.01)  # its own six successes
     assert rates[3] == pytest.approx(1.5 / 8, abs=0.02)  # the kind's: one of seven
@@ -95,8 +97,8 @@ def test_arm_with_few_missions_uses_rate_of_its_kind() -> None:
 
 def test_old_episodes_decay_with_half_life() -> None:
     found = practice(rule="success")
-    found.note(ended("nominal", False, 200))
-    found.note(ended("nominal", True, round(HALF_LIFE_EPISODES)))
+    found.note(ended_episodes("nominal", False, 200))
+    found.note(ended_episodes("nominal", True, round(HALF_LIFE_EPISODES)))
     assert found.failure_rate[0] == pytest.approx(0.5, abs=0.04)
 
 
@@ -104,10 +106,10 @@ def test_shares_move_at_interval_ends_within_the_limit() -> None:
     reported: list[list[float]] = []
     settings = PracticeConfig(rule="success")
     found = Practice(settings, ARMS, reported.append)
-    found.note(ended("nominal", True, 30))
-    assert found.advance(at(999)) == []
-    found.advance(at(1000))
-    found.advance(at(2500))
+    found.note(ended_episodes("nominal", True, 30))
+    assert found.advance(clocks_at(999)) == []
+    found.advance(clocks_at(1000))
+    found.advance(clocks_at(2500))
     assert len(reported) == 3  # at first, and twice after
     steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
     assert steps[0] == pytest.approx(MAX_CHANGE)

@@ -34,7 +34,7 @@ QUOTAS = "max_replays_per_row = 8\n" + "".join(
 SHORT = {"env_steps": 480}
 
 
-class Walker:
+class RandomTeacher:
     """A teacher that draws, so that its state matters."""
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class Walker:
         self.rng.bit_generator.state = state
 
 
-def logs_by(text: str, conditions: Iterable[Condition]) -> Callable[[Path], Logs]:
+def logs_of_mixture(text: str, conditions: Iterable[Condition]) -> Callable[[Path], Logs]:
     def made(folder: Path) -> Logs:
         rows = pa.concat_tables([recording_transitions(n, task=TASK) for n in (1, 2, 3)])
         mixture = parse_mixture(f"discount = 0.9\n{text}")
@@ -71,24 +71,24 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[
     "a teacher and its filter": (
         {"teacher": {"source": "given", "ratio": 0.5, "offline_updates": 40}},
         None,
-        Walker,
+        RandomTeacher,
     ),
     "navigation's proposals": ({"teacher": {"source": "planner"}}, None, lambda: None),
     "practice": ({"practice": {"rule": "success"}}, None, lambda: None),
     "shares of logged rows": (
         {"replay": {"logs_share": None}},
-        logs_by(LIMITED, CONDITIONS),
+        logs_of_mixture(LIMITED, CONDITIONS),
         lambda: None,
     ),
     "quotas that fresh rows fill": (
         {"replay": {"logs_share": None}},
-        logs_by(QUOTAS, TOY_CONDITIONS),
+        logs_of_mixture(QUOTAS, TOY_CONDITIONS),
         lambda: None,
     ),
 }
 
 
-def interrupted(live: Session, stop: Callable[[], bool]) -> None:
+def train_until(live: Session, stop: Callable[[], bool]) -> None:
     with pytest.raises(TrainingInterrupted, match="restock train --resume"):
         train(live, stop=stop)
     live.close()
@@ -110,9 +110,9 @@ def test_interrupted_run_matches_uninterrupted_run(case, tmp_path, monkeypatch):
     whole.close()
     # Once on the logs, once while it learns in the twin.
     cut = opened("cut")
-    interrupted(cut, lambda: cut.learner.gradient_steps >= 20)
+    train_until(cut, lambda: cut.learner.gradient_steps >= 20)
     again = opened("cut", resume=True)
-    interrupted(again, lambda: again.progress.env_steps >= 350)
+    train_until(again, lambda: again.progress.env_steps >= 350)
     last = opened("cut", resume=True)
     train(last)
     last.close()
@@ -133,7 +133,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, settings: TrainConfig)
     return run_to_end(tmp_path_factory.mktemp("runs") / "undisturbed", settings)
 
 
-def resumed(path: Path, settings: TrainConfig) -> Session:
+def resume_and_train(path: Path, settings: TrainConfig) -> Session:
     live = session(path, settings, resume=True)
     train(live)
     live.close()
@@ -153,11 +153,11 @@ def test_resume_repeats_abandoned_evaluation(undisturbed, settings, tmp_path, ev
         return drive(*args, **kwargs)
 
     live.evaluation_buffer.drive = driving  # type: ignore[method-assign]
-    interrupted(live, lambda: len(begun) == evaluation and next(steps, None) is None)
+    train_until(live, lambda: len(begun) == evaluation and next(steps, None) is None)
     assert begun == [0, 400, 800][:evaluation]
     evaluated = pq.read_table(path / "evaluations.parquet")["env_steps"].unique().to_pylist()
     assert evaluated == begun[:-1]
-    assert_same_run(undisturbed, resumed(path, settings))
+    assert_same_run(undisturbed, resume_and_train(path, settings))
 
 
 def test_killed_run_resumes_from_checkpoint(undisturbed, settings, tmp_path):
@@ -175,4 +175,4 @@ def test_killed_run_resumes_from_checkpoint(undisturbed, settings, tmp_path):
         train(live, notify=kill)
     live.close()
     assert 0 < checkpoint.load(live.run.latest)["progress"]["env_steps"] < live.progress.env_steps
-    assert_same_run(undisturbed, resumed(path, settings))
+    assert_same_run(undisturbed, resume_and_train(path, settings))

@@ -41,7 +41,7 @@ def test_flipped_bit_in_table_is_reported(tmp_path, read):
         except RestockError as error:
             refused.append(str(error))
     assert len(refused) > 40
-    assert all("policies.parquet" in said for said in refused)
+    assert all("policies.parquet" in message for message in refused)
 
 
 def test_table_shorter_than_checkpoint_is_rejected(tmp_path: Path) -> None:

@@ -48,8 +48,8 @@ def test_shares_respect_replay_cap_of_planned_draws() -> None:
     plan = controller(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.75, 0.25])
     assert plan.logs_share == pytest.approx(0.1)
-    said = r"offline phase draws 30,000 rows of logs.*400 rows"
-    with pytest.raises(MixtureError, match=said) as raised:
+    message = r"offline phase draws 30,000 rows of logs.*400 rows"
+    with pytest.raises(MixtureError, match=message) as raised:
         controller(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
     assert "lower schedule.offline_updates to 66.6% of its value" in str(raised.value)
     controller(text, [300, 100], PlannedDraws(19_980, 100_000, 0, 1000))
@@ -88,7 +88,7 @@ def panel(table: pa.Table, path: Path, text: str) -> Panel:
     return build_panel(table, parse_mixture(whole), path, task=TOY_TASK, conditions=CONDITIONS)
 
 
-def draws_of(panel: Panel, planned: PlannedDraws) -> LoggedSampler:
+def sampler_of(panel: Panel, planned: PlannedDraws) -> LoggedSampler:
     return Logs.of_panel(panel, planned).sampler(64, None, 0)
 
 
@@ -96,7 +96,7 @@ def draws_of(panel: Panel, planned: PlannedDraws) -> LoggedSampler:
 def test_no_row_exceeds_max_replays(table, tmp_path, within):
     text = f"max_replays_per_row = 9\nwithin = '{within}'\n[each_condition]\nshare = 'equal'\n"
     built = panel(table, tmp_path / "p", text)
-    draws = draws_of(built, PlannedDraws(offline=4_000))
+    draws = sampler_of(built, PlannedDraws(offline=4_000))
     rng = np.random.default_rng(0)
     counted = np.zeros(len(built), np.int64)
     drawn = 0
@@ -122,7 +122,7 @@ def test_no_row_exceeds_max_replays(table, tmp_path, within):
 def test_exhausted_stratum_gives_its_share_to_others(table: pa.Table, tmp_path: Path) -> None:
     text = "max_replays_per_row = 20\n[[strata]]\nname = 'near_collision'\nshare = 0.5\n"
     built = panel(table, tmp_path / "p", text + "[each_condition]\n")
-    draws = draws_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
+    draws = sampler_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
     place = [stratum.name for stratum in built.strata].index("near_collision")
     assert draws.controller.shares[place] == 0.5
     limit = 20 * built.strata[place].rows
@@ -139,7 +139,7 @@ def test_weights_follow_current_shares(table: pa.Table, tmp_path: Path) -> None:
     """Full correction keeps P(outcome) what it was, however the shares move."""
     text = LIMITED.replace("density_ratio", "full")
     built = panel(table, tmp_path / "p", text)
-    draws = draws_of(built, PlannedDraws(0, 1_000, 0, 1200))
+    draws = sampler_of(built, PlannedDraws(0, 1_000, 0, 1200))
     post = np.array([stratum.timing == "post" for stratum in built.strata])
     rows = np.array([stratum.rows for stratum in built.strata])
     moved = []

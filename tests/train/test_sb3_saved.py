@@ -22,7 +22,7 @@ BATCH = 32
 Places = dict[bytes, set[tuple[int, int]]]
 
 
-class Seen(gymnasium.Wrapper):
+class RecordingEnv(gymnasium.Wrapper):
     """Keeps every observation with its episode and step, by its bytes."""
 
     def __init__(self, place: Places) -> None:
@@ -58,7 +58,7 @@ def saved(tmp_path: Path, place: Places) -> Any:
     fed = {"panel": str(panel.path), "run": str(tmp_path / "run"), "n_step": 3, "log_every": 10}
     model = sb3_model(
         "DQN",
-        DummyVecEnv([lambda: Seen(place)]),
+        DummyVecEnv([lambda: RecordingEnv(place)]),
         fed,
         buffer_size=1000,
         learning_starts=20,

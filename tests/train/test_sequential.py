@@ -12,7 +12,9 @@ from restock.train.judge.sequential import ConfidenceSequence, bets, pairs_neede
 MARGIN, VARIANCE = 0.05, 0.25
 
 
-def paired(success: float, baseline: float, correlation: float, shape: tuple[int, int]) -> F64:
+def paired_differences(
+    success: float, baseline: float, correlation: float, shape: tuple[int, int]
+) -> F64:
     """Draw differences in success between two policies on the same missions."""
     spread = np.sqrt(success * (1 - success) * baseline * (1 - baseline))
     both = success * baseline + correlation * spread
@@ -21,7 +23,7 @@ def paired(success: float, baseline: float, correlation: float, shape: tuple[int
     return np.where(uniform < better, 1.0, np.where(uniform < better + worse, -1.0, 0.0))
 
 
-def passing(differences: F64, error: float = 0.05) -> float:
+def passing_share(differences: F64, error: float = 0.05) -> float:
     """Return the share of rows (n, pairs) that ever show a mean above the margin."""
     wealth, most = np.zeros(len(differences)), np.zeros(len(differences))
     for pair in range(differences.shape[1]):
@@ -42,17 +44,17 @@ def passing(differences: F64, error: float = 0.05) -> float:
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
 def test_policy_at_margin_rarely_passes(correlation: float) -> None:
     runs = 600
-    share = passing(paired(0.85, 0.9, correlation, (runs, 300)))
+    share = passing_share(paired_differences(0.85, 0.9, correlation, (runs, 300)))
     assert wilson(round(share * runs), runs)[0] <= 0.05
-    assert passing(paired(0.8, 0.9, correlation, (runs, 300))) == 0.0
+    assert passing_share(paired_differences(0.8, 0.9, correlation, (runs, 300))) == 0.0
 
 
 def test_confidence_sequence_matches_its_bets() -> None:
-    for row in paired(0.9, 0.9, 0.5, (5, 400)):
+    for row in paired_differences(0.9, 0.9, 0.5, (5, 400)):
         sequence = ConfidenceSequence(1.0, -MARGIN, variance=VARIANCE)
         for difference in row:
             sequence.add(float(difference))
-        assert (sequence.above_at is not None) == (passing(row[None]) == 1.0)
+        assert (sequence.above_at is not None) == (passing_share(row[None]) == 1.0)
         assert sequence.below_at is None
 
 

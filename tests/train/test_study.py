@@ -79,9 +79,9 @@ def test_study_runs_each_arm_once_and_compares(tmp_path: Path, capsys, shell: Sh
 def test_failed_run_names_its_log_file(tmp_path: Path, shell: Shell) -> None:
     text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)
-    said = " ".join(shell.err("train", tmp_path / "s.toml", "--out", tmp_path / "o").split())
-    assert "plain-0.log: `restock train` failed with exit code 2" in said
-    assert "nowhere.toml" in said
+    error = " ".join(shell.err("train", tmp_path / "s.toml", "--out", tmp_path / "o").split())
+    assert "plain-0.log: `restock train` failed with exit code 2" in error
+    assert "nowhere.toml" in error
 
 
 def test_dry_run_lists_the_runs(tmp_path: Path, shell: Shell) -> None:
@@ -120,7 +120,7 @@ treatment = "method"
     ]
 
 
-def trained_before(tmp_path: Path, text: str) -> Path:
+def make_finished_runs(tmp_path: Path, text: str) -> Path:
     """Write s.toml; return its folder of results, in which all was trained and evaluated."""
     (tmp_path / "s.toml").write_text(text)
     plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
@@ -134,18 +134,18 @@ def test_changed_study_reports_differences(tmp_path: Path, shell: Shell) -> None
     study = tmp_path / "s.toml"
     arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
     text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
-    moved = trained_before(tmp_path, text).rename(tmp_path / "moved")
+    moved = make_finished_runs(tmp_path, text).rename(tmp_path / "moved")
     line = ["train", str(study), "--out", str(moved), "--dry-run", "--json"]
     assert all(row["done"] for row in json.loads(shell.out(*line)))
     study.write_text(text.replace("n_step = 1", "n_step = 3"))
-    said = " ".join(shell.err(*line).split())
-    assert "then loss.n_step=1, now loss.n_step=3" in said
+    error = " ".join(shell.err(*line).split())
+    assert "then loss.n_step=1, now loss.n_step=3" in error
     study.write_text(text.replace("'p'", "'q'"))
     assert 'then panel = "p", now panel = "q"' in " ".join(shell.err(*line).split())
 
 
 def test_comparisons_use_treatment_of_their_arm(tmp_path: Path, capsys, monkeypatch) -> None:
-    out = trained_before(tmp_path, TWICE)
+    out = make_finished_runs(tmp_path, TWICE)
     dueling = Difference("config.network.layer_norm", "algorithm", True, False)
 
     def compared(first, second, *, treatment):
@@ -169,7 +169,7 @@ def test_comparisons_use_treatment_of_their_arm(tmp_path: Path, capsys, monkeypa
 
 
 def test_failed_comparison_does_not_stop_study(tmp_path: Path, monkeypatch, shell: Shell) -> None:
-    out = trained_before(tmp_path, TWICE)
+    out = make_finished_runs(tmp_path, TWICE)
 
     def compared(first, second, *, treatment):
         if treatment == "algorithm":
@@ -186,18 +186,18 @@ def test_failed_comparison_does_not_stop_study(tmp_path: Path, monkeypatch, shel
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ("schedule.env_steps = 1_500", "'a' would make no update: its schedule.env_steps (1,500)"),
         ("schedule.env_steps = 2_000", "and it has no logs"),
     ],
 )
-def test_arm_without_updates_is_rejected(tmp_path, settings, said) -> None:
+def test_arm_without_updates_is_rejected(tmp_path, settings, message) -> None:
     study = f"store = 's'\n[settings]\n{settings}\n"
     (tmp_path / "s.toml").write_text(study + TWO)
     with pytest.raises(ConfigError) as refused:
         load_study(tmp_path / "s.toml")
-    assert said in str(refused.value)
+    assert message in str(refused.value)
     with_logs = TWO.replace("'\n", "'\nmixture = 'uniform'\n")
     (tmp_path / "s.toml").write_text(study + with_logs)
     assert load_study(tmp_path / "s.toml")
@@ -217,15 +217,15 @@ def test_no_run_starts_after_a_failure(tmp_path, capsys, monkeypatch, interrupte
             raise RunError("ran out of disk", where="here")
         running.set()
         for _ in range(3000):  # until the failure is said
-            if "waiting for those under way" in "".join(said):
+            if "waiting for those under way" in "".join(messages):
                 break
             sleep(0.01)
         if interrupted:
             pthread_kill(main_thread().ident, SIGINT)
             assert ended.wait(30)
 
-    said: list[str] = []
-    monkeypatch.setattr("restock.cli.learning.study.say", said.append)
+    messages: list[str] = []
+    monkeypatch.setattr("restock.cli.learning.study.say", messages.append)
     monkeypatch.setattr(study_run, "run_job", job)
     monkeypatch.setattr(study_run, "interrupt_running", ended.set)
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 1]"))
@@ -233,7 +233,7 @@ def test_no_run_starts_after_a_failure(tmp_path, capsys, monkeypatch, interrupte
     assert main(argv) == (130 if interrupted else 2)
     assert ended.is_set() is interrupted
     assert sorted(begun) == ["dueling-0", "plain-0"]
-    assert "here: ran out of disk" in said
+    assert "here: ran out of disk" in messages
 
 
 def test_dry_run_checks_mixtures(tmp_path: Path, shell: Shell) -> None:
@@ -250,7 +250,7 @@ def test_dry_run_checks_mixtures(tmp_path: Path, shell: Shell) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("arms = []", "arms must be two or more"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "but the study has no store"),
@@ -277,7 +277,7 @@ def test_dry_run_checks_mixtures(tmp_path: Path, shell: Shell) -> None:
         ),
     ],
 )
-def test_invalid_study_is_rejected(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_study_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         load_study(tmp_path / "s.toml")

@@ -8,7 +8,7 @@ from restock.train.dqn.config import Hard, Polyak, describe
 from restock.train.dqn.learner import TargetUpdate, value_lag
 
 
-class One(nn.Module):
+class ScalarEstimate(nn.Module):
     """An estimate of one number."""
 
     def __init__(self, value: float) -> None:
@@ -18,7 +18,7 @@ class One(nn.Module):
 
 def test_hard_target_of_two_clocks_example() -> None:
     """One state with a self-loop (reward 1, discount .5) closes on 1 before the sync."""
-    online, target = One(0.0), One(0.0)
+    online, target = ScalarEstimate(0.0), ScalarEstimate(0.0)
     clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
     history = []
     for step in range(1, 5):
@@ -36,7 +36,7 @@ def test_hard_target_of_two_clocks_example() -> None:
 
 
 def test_polyak_by_hand() -> None:
-    online, target = One(1.0), One(0.0)
+    online, target = ScalarEstimate(1.0), ScalarEstimate(0.0)
     clock = TargetUpdate(Polyak(tau=0.1), online.parameters(), target.parameters())
     values = []
     for step in range(1, 4):
@@ -47,7 +47,7 @@ def test_polyak_by_hand() -> None:
 
 
 def test_distance_is_relative_to_the_online_parameters() -> None:
-    online, target = One(4.0), One(3.0)
+    online, target = ScalarEstimate(4.0), ScalarEstimate(3.0)
     clock = TargetUpdate(Hard(every=2), online.parameters(), target.parameters())
     assert clock.distance() == pytest.approx(0.25)
     clock.after(2)

@@ -23,7 +23,7 @@ PANEL = {
 CURVES = [(100, {"loss": 2.0, "phase": "online"}), (200, {"loss": 0.5, "q_mean": 1.5})]
 
 
-class Broken:
+class FailingTracker:
     """Takes nothing."""
 
     name = "mlflow"
@@ -41,7 +41,7 @@ class Broken:
         return {"uri": "http://tracker"}
 
 
-def a_run(path: Path) -> Run:
+def make_run(path: Path) -> Run:
     panel = path.with_name("panel")
     panel.mkdir()
     (panel / "panel.json").write_text("{}")
@@ -49,7 +49,7 @@ def a_run(path: Path) -> Run:
     return Run.create(path, {"config": config, "panel": PANEL | {"path": str(panel)}})
 
 
-def follow(run: Run, name: str) -> Events:
+def log_curves(run: Run, name: str) -> Events:
     """Return a run's curves, to one tracker."""
     events = Events(run.path, tracker_sinks(run, [name]))
     for step, values in CURVES:
@@ -59,11 +59,11 @@ def follow(run: Run, name: str) -> Events:
 
 
 def test_failing_tracker_does_not_stop_training(tmp_path, monkeypatch, capsys):
-    def refuses() -> Broken:
+    def refuses() -> FailingTracker:
         raise OSError("no route to host")
 
     def sinks(run: Run, names: Any, from_step: int | None) -> dict[str, Any]:
-        return {"wandb": refuses, "mlflow": Broken} if names else {}
+        return {"wandb": refuses, "mlflow": FailingTracker} if names else {}
 
     monkeypatch.setattr("restock.train.session.tracker_sinks", sinks)
     budget = {"env_steps": 240, "warmup_env_steps": 60, "offline_updates": 10}
@@ -100,8 +100,8 @@ def test_mlflow_has_the_curves_config_and_panel(tmp_path, monkeypatch):
     uri = (tmp_path / "mlruns").as_uri()
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    run = a_run(tmp_path / "a")
-    events = follow(run, "mlflow")
+    run = make_run(tmp_path / "a")
+    events = log_curves(run, "mlflow")
     assert events.failures["mlflow"].failed == 0
     known = tracked(run.path)["mlflow"]
     assert known["uri"] == uri

@@ -252,9 +252,9 @@ def test_invalid_arguments_are_rejected_before_writing(
         pytest.skip("there is a CUDA device")
     places = {"new": tmp_path / "new", "missing": tmp_path / "no"}
     places |= {"trained": trained, "panel": panel}
-    said = shell.err(*[part.format(**places) for part in argv])
-    assert complaint in said
-    assert "Traceback" not in said
+    error = shell.err(*[part.format(**places) for part in argv])
+    assert complaint in error
+    assert "Traceback" not in error
     assert not (tmp_path / "new").exists()
 
 
@@ -273,13 +273,13 @@ def test_moved_panel_is_found_through_symlink(trained, panel, tmp_path, shell):
 def test_panel_of_unknown_task_is_rejected(tmp_path, shell):
     build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
-    said = shell.err(*argv)
-    assert "no shipped profile has this task" in said
-    assert "--set profile=my_robot.toml" in said
-    said = shell.err(*argv, "--set", "profile=warehouse_amr")
-    assert "observation, action or reward differ" in said
-    assert "leave out `profile` in the config" in said
-    assert load_profile("warehouse_amr").task.hash in said
+    error = shell.err(*argv)
+    assert "no shipped profile has this task" in error
+    assert "--set profile=my_robot.toml" in error
+    error = shell.err(*argv, "--set", "profile=warehouse_amr")
+    assert "observation, action or reward differ" in error
+    assert "leave out `profile` in the config" in error
+    assert load_profile("warehouse_amr").task.hash in error
     assert not (tmp_path / "run").exists()
 
 

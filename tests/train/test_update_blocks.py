@@ -21,7 +21,7 @@ from restock.train.session import Session
 
 OFFLINE = {"env_steps": 0, "offline_updates": 3 * LONGEST + 5}
 # What the policy would do in audited rows is asked at the end of a block.
-OF_POLICY = {"actions", "audit"}
+POLICY_TABLES = {"actions", "audit"}
 
 
 @pytest.fixture(params=["cpu", "cuda"])
@@ -44,13 +44,13 @@ def in_blocks(
     return live
 
 
-def trained(live: Session) -> Session:
+def train_and_close(live: Session) -> Session:
     train(live)
     live.close()
     return live
 
 
-WAYS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "every term": {
         "loss": {"conservative": 0.5, "margin": 0.5},
@@ -61,12 +61,12 @@ WAYS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_blocks_match_single_updates(way: str, device: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_blocks_match_single_updates(variant: str, device: str, tmp_path: Path) -> None:
     """What is fed, to the bit; what is learnt, but for rounding."""
-    changes = {**WAYS[way], "schedule": OFFLINE}
+    changes = {**VARIANTS[variant], "schedule": OFFLINE}
     one = run_to_end(tmp_path / "one", config(**changes))
-    blocks = trained(in_blocks(tmp_path / "blocks", device, **changes))
+    blocks = train_and_close(in_blocks(tmp_path / "blocks", device, **changes))
     assert blocks.learner.gradient_steps == one.learner.gradient_steps == OFFLINE["offline_updates"]
     assert blocks.learner.target.last_sync == one.learner.target.last_sync
     for name in ("network", "target_network", "policy"):
@@ -86,12 +86,12 @@ def test_online_run_in_blocks_matches_single_updates(tmp_path: Path) -> None:
     """Online too: the ring, the target's clock, the intervals and what is recorded."""
     short = {"schedule": {"env_steps": 800}}
     one = run_to_end(tmp_path / "one", config(**short))
-    blocks = trained(in_blocks(tmp_path / "blocks", "cpu", **short))
+    blocks = train_and_close(in_blocks(tmp_path / "blocks", "cpu", **short))
     for name, value in one.learner.policy.state_dict().items():
         assert torch.equal(value, blocks.learner.policy.state_dict()[name]), name
     np.testing.assert_array_equal(one.ring.rows, blocks.ring.rows)
     fed, expected = tables(blocks.run.path), tables(one.run.path)
-    for name in expected.keys() - OF_POLICY:
+    for name in expected.keys() - POLICY_TABLES:
         assert fed[name].equals(expected[name]), name
     audit = [name for name in expected["audit"].column_names if name != "greedy_action"]
     assert fed["audit"].select(audit).equals(expected["audit"].select(audit))
@@ -99,14 +99,14 @@ def test_online_run_in_blocks_matches_single_updates(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_run_in_blocks_is_repeatable_and_resumable(device: str, tmp_path: Path) -> None:
-    whole = trained(in_blocks(tmp_path / "whole", device))
-    assert_same_run(whole, trained(in_blocks(tmp_path / "again", device)))
+    whole = train_and_close(in_blocks(tmp_path / "whole", device))
+    assert_same_run(whole, train_and_close(in_blocks(tmp_path / "again", device)))
     stopped = in_blocks(tmp_path / "stopped", device)
     requested = iter(range(150))
     with pytest.raises(Exception, match="restock train --resume"):
         train(stopped, stop=lambda: next(requested, None) is None)
     stopped.close()
-    resumed = trained(in_blocks(tmp_path / "stopped", device, resume=True))
+    resumed = train_and_close(in_blocks(tmp_path / "stopped", device, resume=True))
     assert_same_run(whole, resumed)
 
 
@@ -119,7 +119,7 @@ def test_priorities_feed_blocks_like_single_updates(device, tmp_path):
     one = run_to_end(tmp_path / "one", config(**changes), logs=Logs.of_panel(built))
     live = in_blocks(tmp_path / "blocks", device, logs=Logs.of_panel(built), **changes)
     assert live.batches.needs_td
-    blocks = trained(live)
+    blocks = train_and_close(live)
     fed, expected = tables(blocks.run.path)["audit"], tables(one.run.path)["audit"]
     of_logs = [table.filter(pc.equal(table["source"], "logs")) for table in (fed, expected)]
     rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "reward"]

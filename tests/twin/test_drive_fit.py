@@ -37,7 +37,7 @@ def profile_of(robot: Robot, body: Body) -> Profile:
 _INPUTS = ("command", "pose", "wheels", "imu", "scan")
 
 
-def recorded(profile: Profile, folder: Path) -> Path:
+def record_drive(profile: Profile, folder: Path) -> Path:
     """Return a drive under `TRUE` on an empty floor, each command held for a second."""
     robot = robot_model(profile.robot, profile.task.body)
     sim = Simulation(1, profile.task, empty_floor(), 0.01, 1, robot=robot)
@@ -64,10 +64,10 @@ def recorded(profile: Profile, folder: Path) -> Path:
         "pose.pose.orientation.w": np.cos(yaw / 2)[slow],
     }
     measured = {"angular_velocity.z": np.array([state.yaw_rate_radps[0] for state in states])}
-    told = {"linear.x": commanded[:, 0], "angular.z": commanded[:, 1]}
+    velocity = {"linear.x": commanded[:, 0], "angular.z": commanded[:, 1]}
     turned = {"twist.twist.linear.x": wheels[:, 0], "twist.twist.angular.z": wheels[:, 1]}
     topics = {
-        "/cmd_vel": columns(ticks + 0.003, told, stamped=False),
+        "/cmd_vel": columns(ticks + 0.003, velocity, stamped=False),
         "/amcl_pose": columns(at[slow], place),
         "/odom": columns(at, turned),
         "/imu": columns(at, measured | {"linear_acceleration.x": np.zeros(len(at))}),
@@ -80,7 +80,7 @@ def recorded(profile: Profile, folder: Path) -> Path:
 def test_latency_and_gain_of_steering_robot_are_recovered(tmp_path, capsys):
     profile = profile_of(CAR, OUTLINE)
     (tmp_path / "own.toml").write_text(profile_toml(profile))
-    bag = recorded(profile, tmp_path / "bag")
+    bag = record_drive(profile, tmp_path / "bag")
     store = tmp_path / "store"
     arguments = ["--profile", str(tmp_path / "own.toml"), "--store", str(store)]
     assert cli.main(["ingest", str(bag), *arguments]) == ExitCode.OK
@@ -89,6 +89,6 @@ def test_latency_and_gain_of_steering_robot_are_recovered(tmp_path, capsys):
     fitted = load_perturbation(out)
     assert fitted.latency_s == pytest.approx(TRUE.latency_s, abs=0.015)
     assert fitted.gain == pytest.approx(TRUE.gain, abs=0.01)
-    said = " ".join(out.read_text().split()) + " ".join(capsys.readouterr().out.split())
-    assert "a robot that steers turns by its steering angle" in said
+    text = " ".join(out.read_text().split()) + " ".join(capsys.readouterr().out.split())
+    assert "a robot that steers turns by its steering angle" in text
     assert cli.main(["twin", "gap", str(store), "--perturbation", str(out)]) == ExitCode.OK

@@ -140,14 +140,14 @@ def test_residuals_interpolate_between_latencies(log: LoggedSegments) -> None:
     assert middle == pytest.approx(0.75 * low + 0.25 * high)
 
 
-def recovered(store: Path, names: tuple[str, ...], **options: object) -> FittedTwin:
+def fit_store(store: Path, names: tuple[str, ...], **options: object) -> FittedTwin:
     with Store(store) as opened:
         return fit(opened, FitConfig(parameters=names, **options))  # type: ignore[arg-type]
 
 
 @pytest.mark.long
 def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path) -> None:
-    found = recovered(
+    found = fit_store(
         known,
         ("latency_s", "gain", "wheel_radius_scale"),
         horizon_s=2.0,
@@ -281,7 +281,7 @@ def test_all_parameters_of_known_robot_are_recovered(tmp_path: Path) -> None:
         latency_s=0.13,
         gain=0.96,
     )
-    found = recovered(store_of(tmp_path, true, missions=23), DEFAULT, held_out=0.25)
+    found = fit_store(store_of(tmp_path, true, missions=23), DEFAULT, held_out=0.25)
     within = {
         "friction_scale": 0.01,
         "payload_kg": 6.0,
@@ -302,6 +302,6 @@ def test_fit_command_prints_json(known, monkeypatch, shell: Shell) -> None:
     of = "restock.train.twin.calibration.fit.FitConfig"
     monkeypatch.setattr(of, partial(FitConfig, search_points=2))
     line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2"]
-    said = shell.json(*line, "--segments", "8")
-    assert [item["name"] for item in said["fits"][0]["estimates"]] == ["gain"]
-    assert said["out"] is None
+    document = shell.json(*line, "--segments", "8")
+    assert [item["name"] for item in document["fits"][0]["estimates"]] == ["gain"]
+    assert document["out"] is None

@@ -98,13 +98,15 @@ def test_true_parameters_reduce_the_gap(gap, horizon_s):
 
 
 def test_slippery_floor_is_untrusted(gap: TwinGap) -> None:
-    said = {found.condition: found for found in gap.verdicts}
-    assert said["wheel_slip"].verdict == UNTRUSTED
-    assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
-    assert said["nominal"].verdict == TRUSTED
+    verdicts = {found.condition: found for found in gap.verdicts}
+    assert verdicts["wheel_slip"].verdict == UNTRUSTED
+    assert (
+        "metres" in verdicts["wheel_slip"].reasons[0] or " m " in verdicts["wheel_slip"].reasons[0]
+    )
+    assert verdicts["nominal"].verdict == TRUSTED
     # Right beside a rack the twin touches it where the log's robot did not, which costs most.
     assert gap.untrusted == ["recovery", "wheel_slip"]
-    assert "reward" in said["recovery"].reasons[0]
+    assert "reward" in verdicts["recovery"].reasons[0]
     assert any("patches" in line for line in gap.not_done)
 
 
@@ -225,10 +227,10 @@ def test_turtlebot3_gap_is_unknown(tmp_path: Path) -> None:
     with Store(tmp_path) as store:
         gap = measure_gap(store)
     assert {found.verdict for found in gap.verdicts} == {UNKNOWN}  # one episode of half a minute
-    said = " ".join(gap.not_done)
-    assert "{" not in said
+    text = " ".join(gap.not_done)
+    assert "{" not in text
     for not_there in ("another floor", "no goal and no plan", "wheel odometry", "no fitted"):
-        assert not_there in said, not_there
+        assert not_there in text, not_there
     assert position(gap, "nominal", BEFORE, 1.0)["median"] < 0.02
     assert not [row for row in gap.observations if row["component"].startswith("clearance_")]
 

@@ -36,7 +36,7 @@ def environments() -> list[WarehouseVectorEnv]:
     return [environment("default"), environment("generated:test:3"), environment("default", behind)]
 
 
-def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+def cast_both_ways(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Return the ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
     found = []
     for used in (True, False):
@@ -58,7 +58,7 @@ def test_compiled_ranges_match_mujoco(which, places, environments):
         floor = env.floor_of(index)
         env.simulation.place_robot(index, x * floor.width_m, y * floor.depth_m, yaw)
     with pytest.MonkeyPatch.context() as patch:
-        compiled, cast = both(env, patch)
+        compiled, cast = cast_both_ways(env, patch)
     np.testing.assert_allclose(compiled, cast, rtol=1e-12, atol=1e-12)
     assert np.isfinite(compiled).all()  # a floor has walls
 
@@ -73,9 +73,9 @@ def test_lidar_sees_people_pallets_and_forklifts(environments, monkeypatch):
         place = moving.position_m[0, kind.start]
         kept = place.copy()
         place[:] = -40.0, -40.0, 0.3
-        without = both(environments[0], monkeypatch)
+        without = cast_both_ways(environments[0], monkeypatch)
         place[:] = x + 1.0, y + 0.3, 0.3
-        there = both(environments[0], monkeypatch)
+        there = cast_both_ways(environments[0], monkeypatch)
         place[:] = kept
         np.testing.assert_allclose(there[0], there[1], rtol=1e-12, atol=1e-12)
         assert (there[0][0] < without[0][0] - 0.1).any()
@@ -143,14 +143,16 @@ def test_robot_command_shows_lidar_and_warnings(tmp_path, shell):
     robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"
     text = WAREHOUSE.replace("lidar_x_m = 0.0", "lidar_x_m = -0.5") + robot
     (tmp_path / "amr.toml").write_text(text)
-    said = shell.json("twin", "robot", tmp_path / "amr.toml")
-    assert {key: said["robot"][f"body.{key}"] for key in ("length_m", "width_m", "lidar_x_m")} == {
+    document = shell.json("twin", "robot", tmp_path / "amr.toml")
+    assert {
+        key: document["robot"][f"body.{key}"] for key in ("length_m", "width_m", "lidar_x_m")
+    } == {
         "length_m": 0.7,
         "width_m": 0.5,
         "lidar_x_m": -0.5,
     }
-    assert said["robot"]["lidar.angle_max_rad"] == 1.5
-    assert said["outside"] == [
+    assert document["robot"]["lidar.angle_max_rad"] == 1.5
+    assert document["outside"] == [
         "the lidar is 0.15 m outside the outline of [task.body]",
         "caster 1 is 0.25 m outside the outline of [task.body]",
     ]

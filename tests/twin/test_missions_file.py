@@ -32,7 +32,7 @@ def orders(*given: MissionOrder) -> MissionOrders:
     return MissionOrders(given, [FLOOR], PLANNERS, where="next.toml")
 
 
-def ordered(*given: MissionOrder, seed: int = 0) -> OrderedMissions:
+def ordered_missions(*given: MissionOrder, seed: int = 0) -> OrderedMissions:
     file = MissionsFile(missions=given)
     return OrderedMissions(orders(*given), file, seed, "handover", Perturbation())
 
@@ -67,7 +67,7 @@ def test_orders_the_twin_lacks_are_rejected_by_name(order: MissionOrder, message
 
 
 def test_rounds_continue_until_enough_missions_count() -> None:
-    missions = ordered(SLIP, MissionOrder(kind="near_collision", missions=2))
+    missions = ordered_missions(SLIP, MissionOrder(kind="near_collision", missions=2))
     driven = []
     for one_round in missions.rounds():
         for number, mission in enumerate(one_round):
@@ -146,7 +146,9 @@ def test_recorded_missions_close_coverage_gaps(tmp_path, shell):
     assert came > 0.5 * slip["missing"]
 
 
-def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) -> list[EpisodeSpec]:
+def draw_specs(
+    missions: tuple[MissionOrder, ...], share: float, count: int = 400
+) -> list[EpisodeSpec]:
     """Return the episodes that one of two environments begins."""
     queue = EpisodeQueue(2, [FLOOR], {"nominal": 1.0}, None, seed=5)
     if missions:
@@ -156,13 +158,13 @@ def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) ->
 
 def test_missions_share_sets_share_of_episodes() -> None:
     missions = (SLIP, MissionOrder(kind="blocked_aisle", missions=12))
-    plain, mixed = drawn((), 0.5), drawn(missions, 0.5)
+    plain, mixed = draw_specs((), 0.5), draw_specs(missions, 0.5)
     kinds = Counter(spec.condition for spec in mixed)
     assert kinds["blocked_aisle"] == pytest.approx(150, abs=30)
     assert kinds["wheel_slip"] == pytest.approx(50, abs=22)
-    assert mixed == drawn(missions, 0.5)
+    assert mixed == draw_specs(missions, 0.5)
     assert set(mixed) - set(plain) == {s for s in mixed if s.condition != "nominal"}
-    assert all(spec.condition != "nominal" for spec in drawn(missions, 1.0))
+    assert all(spec.condition != "nominal" for spec in draw_specs(missions, 1.0))
 
 
 def test_run_config_keeps_missions_as_practice(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from restock.train.twin.physics.perturbation import Perturbation
 LATE = Perturbation(name="late", latency_s=0.15, wheel_radius_scale=0.96, gyro_bias_radps=0.01)
 
 
-def slower(profile: Profile) -> Profile:
+def with_slow_rate(profile: Profile) -> Profile:
     """Return the profile with steps .3 s apart, at a steady rate instead of one per command."""
     task = msgspec.structs.replace(profile.task, control_period_s=0.3)
     clock = msgspec.structs.replace(profile.clock, steps="rate")
@@ -35,7 +35,10 @@ def slower(profile: Profile) -> Profile:
 
 LOGS = {
     "sample log": (ROOT / "sample_logs" / "amr_tuesday", load_profile("warehouse_amr")),
-    "steady rate": (ROOT / "sample_logs" / "amr_tuesday", slower(load_profile("warehouse_amr"))),
+    "steady rate": (
+        ROOT / "sample_logs" / "amr_tuesday",
+        with_slow_rate(load_profile("warehouse_amr")),
+    ),
     "turtlebot3": (SHARED / "turtlebot3-sim-humble", load_profile("turtlebot3")),
 }
 

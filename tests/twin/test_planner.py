@@ -57,7 +57,7 @@ def test_lidar_finds_only_full_blocks(block: str) -> None:
     env = WarehouseVectorEnv(len(specs))
     env.set_episodes(specs)
     env.reset()
-    driver = _Straight()
+    driver = _WaypointDriver()
     for _ in range(120):
         env.step(driver.act(env))
         blocked = sum(bool(closures) for closures in env.navigation.closures)
@@ -67,7 +67,7 @@ def test_lidar_finds_only_full_blocks(block: str) -> None:
         assert blocked == 0
 
 
-class _Straight:
+class _WaypointDriver:
     """A driver that follows the near waypoint and stops .5 m before anything."""
 
     def act(self, env: WarehouseVectorEnv) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_operator_gets_past_pallets(layouts: str) -> None:
     assert min(passed.values()) >= 0.9
 
 
-class Watched(Handover):
+class CountingHandover(Handover):
     """A pair of drivers whose handovers are counted, by whether the operator took over."""
 
     def __init__(self) -> None:
@@ -83,14 +83,14 @@ class Watched(Handover):
 
 @pytest.mark.long
 def test_operator_takes_over_and_hands_back() -> None:
-    policy = Watched()
+    policy = CountingHandover()
     assert success(policy, "blocked_aisle")["partial"] >= 0.5
     assert policy.passed[True] >= 8
     assert policy.passed[False] >= 5
 
 
 def test_nominal_aisles_need_no_handover() -> None:
-    policy = Watched()
+    policy = CountingHandover()
     success(policy, "nominal", count=12)
     assert policy.passed.total() <= 2
 

@@ -46,7 +46,7 @@ ROBOTS = {
 }
 
 
-def driven(
+def drive_steadily(
     robot: Robot | None, body: Body, commands: list[tuple[float, float]], friction: float = 1.0
 ) -> tuple[Simulation, NDArray[np.float64]]:
     """Return steady forward speeds and yaw rates (N, 2) under commands (N, 2)."""
@@ -94,7 +94,7 @@ def test_stand_in_drive_is_unchanged() -> None:
 def test_robot_follows_commands(name: str) -> None:
     robot, body, speed, turn = ROBOTS[name]
     commands = [(speed, 0.0), (-speed / 2, 0.0), (0.0, turn), (0.0, -turn / 2)]
-    sim, steady = driven(robot, body, commands)
+    sim, steady = drive_steadily(robot, body, commands)
     np.testing.assert_allclose(steady, commands, atol=0.06 * max(speed, turn))
     assert steady[0, 0] == pytest.approx(speed, rel=0.02)
     assert steady[2, 1] == pytest.approx(turn, rel=0.03)
@@ -105,13 +105,13 @@ def test_robot_follows_commands(name: str) -> None:
 
 def test_skid_steer_turn_depends_on_friction() -> None:
     """Compare skid steer, whose wheels scrub in every turn, with one axle."""
-    sim, _ = driven(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
+    sim, _ = drive_steadily(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)
     one_axle = msgspec.structs.replace(HUSKY, drive="differential", wheelbase_m=None)
     turns = {}
     for robot in (HUSKY, one_axle):
         for friction in (1.0, 0.25):
-            _, steady = driven(robot, Body(0.99, 0.67), [(0.8, 0.6)], friction)
+            _, steady = drive_steadily(robot, Body(0.99, 0.67), [(0.8, 0.6)], friction)
             turns[robot.drive, friction] = steady[0, 1]
     assert turns["differential", 0.25] == pytest.approx(turns["differential", 1.0], rel=0.01)
     assert turns["skid_steer", 0.25] > 1.15 * turns["skid_steer", 1.0]

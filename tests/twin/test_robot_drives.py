@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from twin.test_robot import AMR, amr_with, driven
+from twin.test_robot import AMR, amr_with, drive_steadily
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
@@ -33,7 +33,7 @@ CAR_ACTIONS = (
 @pytest.mark.parametrize("friction", [1.0, 0.25])
 def test_ackermann_robot_follows_commands(friction: float) -> None:
     commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.4, -0.4), (-0.4, 0.3)]
-    sim, steady = driven(CAR, OUTLINE, commands, friction)
+    sim, steady = drive_steadily(CAR, OUTLINE, commands, friction)
     np.testing.assert_allclose(steady, commands, atol=0.01)
     wheels = np.stack(sim.robot.body_velocity(*sim.wheel_speeds().T), axis=-1)
     np.testing.assert_allclose(wheels, commands, atol=0.02)  # the rear axle's odometry
@@ -42,7 +42,7 @@ def test_ackermann_robot_follows_commands(friction: float) -> None:
 
 def test_turning_radius_is_limited_by_steering() -> None:
     assert CAR.min_turning_radius_m == pytest.approx(TIGHTEST_M)
-    _, steady = driven(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
+    _, steady = drive_steadily(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
     assert steady[0] == pytest.approx([0.3, 0.3 / TIGHTEST_M], rel=0.02)
     assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # it stands, its wheels turned
 
@@ -112,7 +112,7 @@ MECANUM = Robot(
 
 def test_omnidirectional_robot_follows_commands() -> None:
     commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.0, 1.0)]
-    _, steady = driven(MECANUM, Body(0.6, 0.5), commands)
+    _, steady = drive_steadily(MECANUM, Body(0.6, 0.5), commands)
     np.testing.assert_allclose(steady, commands, atol=0.03)
 
 

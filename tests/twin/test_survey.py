@@ -66,7 +66,7 @@ def topic(frame: str, count: int, fields: dict[str, Any], late_s: float = 0.0) -
     )
 
 
-def at(path: str, poses: np.ndarray) -> dict[str, Any]:
+def pose_fields(path: str, poses: np.ndarray) -> dict[str, Any]:
     x, y, yaw = np.transpose(poses)
     turned = {"orientation.z": np.sin(yaw / 2), "orientation.w": np.cos(yaw / 2)}
     fields = {"position.x": x, "position.y": y, **turned}
@@ -92,10 +92,10 @@ def write_bag(
         info = {"resolution": grid.cell_m, "width": width, "height": height}
         fields = {f"info.{name}": np.array([value]) for name, value in info.items()}
         cells = np.ascontiguousarray(grid.occupancy.T).ravel() if data is None else data
-        fields |= at("info.origin", np.array([grid.origin])) | {"data": cells[None]}
+        fields |= pose_fields("info.origin", np.array([grid.origin])) | {"data": cells[None]}
         topics["/map"] = topic("map", 1, fields)
     if poses is not None:
-        topics["/amcl_pose"] = topic(frame, len(poses), at("pose.pose", poses))
+        topics["/amcl_pose"] = topic(frame, len(poses), pose_fields("pose.pose", poses))
     if scanned:
         seen = seen_on_lap()
         step = 2 * np.pi / (-120 if clockwise else 120)
@@ -111,10 +111,10 @@ def write_bag(
 def seen_on_lap() -> list[np.ndarray]:
     """Return ranges (120,) at each pose of a lap; 0 beyond 6 m, as a Neato reports."""
     occupancy, reach, seen = hall(), np.arange(0.0, 6.0, 0.01), []
-    for at in lap():
-        bearing = at[2] - np.pi + np.arange(120) * 2 * np.pi / 120
-        x = at[0] + np.cos(bearing)[:, None] * reach
-        y = at[1] + np.sin(bearing)[:, None] * reach
+    for pose in lap():
+        bearing = pose[2] - np.pi + np.arange(120) * 2 * np.pi / 120
+        x = pose[0] + np.cos(bearing)[:, None] * reach
+        y = pose[1] + np.sin(bearing)[:, None] * reach
         cells = np.clip((np.stack([x, y]) / CELL_M).astype(int), 0, [[[179]], [[139]]])
         hit = occupancy[cells[0], cells[1]] > 0
         ranges = np.where(hit.any(axis=1), reach[hit.argmax(axis=1)], 0.0)
@@ -144,8 +144,8 @@ def test_upside_down_lidar_gives_the_same_map(tmp_path: Path) -> None:
         survey(bag, by="scans", profile=parse_profile(one, where="p"))
         for one in (hanging, WAREHOUSE)
     )
-    said = re.compile(r"(\d+)% of their ends")
-    shares = [int(said.findall(" ".join(made.notes))[0]) for made in (right, wrong)]
+    pattern = re.compile(r"(\d+)% of their ends")
+    shares = [int(pattern.findall(" ".join(made.notes))[0]) for made in (right, wrong)]
     assert shares[0] > 95 > shares[1]
 
 
@@ -198,9 +198,9 @@ def test_map_contradicted_by_lidar_is_rejected(tmp_path, shell):
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=elsewhere, scanned=True)
     floor = tmp_path / "floor.toml"
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(floor)]
-    said = " ".join(shell.err(*arguments).split())
-    assert "only 0% of the lidar's returns are on walls of the map" in said
-    assert "--by scans" in said
+    error = " ".join(shell.err(*arguments).split())
+    assert "only 0% of the lidar's returns are on walls of the map" in error
+    assert "--by scans" in error
     assert not floor.exists()
     assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # it was asked for
     near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # of a robot that is badly localised
@@ -290,11 +290,11 @@ def test_floor_picture_is_to_scale(tmp_path: Path) -> None:
     assert block.sum() / per_m**2 == pytest.approx(5.6 * 3.6, rel=0.05)
 
 
-def along(rows: pa.Table, poses: np.ndarray, rows_a_pose: int = 1) -> pa.Table:
+def rows_along(rows: pa.Table, poses: np.ndarray, rows_a_pose: int = 1) -> pa.Table:
     """Return rows at these poses (N, 3), and then at the last."""
-    at = np.minimum(np.arange(len(rows)) // rows_a_pose, len(poses) - 1)
+    pose_index = np.minimum(np.arange(len(rows)) // rows_a_pose, len(poses) - 1)
     names = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
-    return replaced(rows, dict(zip(names, poses[at].T, strict=True)))
+    return replaced(rows, dict(zip(names, poses[pose_index].T, strict=True)))
 
 
 def test_store_gives_floor_of_its_recordings(tmp_path):
@@ -302,7 +302,7 @@ def test_store_gives_floor_of_its_recordings(tmp_path):
     recordings = []
     for recording, part in ((1, slice(0, 60)), (2, slice(60, 200))):
         rows = recording_transitions(recording, episodes=8)
-        recordings.append(along(rows, lap()[part], rows_a_pose=2))
+        recordings.append(rows_along(rows, lap()[part], rows_a_pose=2))
     store = write_store(tmp_path / "store", recordings)
     gone = survey(store)
     assert gone.by == "corridor"
@@ -316,14 +316,14 @@ def test_store_gives_floor_of_its_recordings(tmp_path):
     assert "2 recordings" in made.poses.source
 
 
-def lapped(recording: int, away_m: float) -> pa.Table:
+def lap_rows(recording: int, away_m: float) -> pa.Table:
     """Return the rows of a drive around the hall, in a frame shifted by this much."""
     rows = with_clear_view(recording_transitions(recording, episodes=8))
-    return along(rows, lap() + np.array([away_m, 0.0, 0.0]))
+    return rows_along(rows, lap() + np.array([away_m, 0.0, 0.0]))
 
 
 def test_recordings_in_other_frames_get_own_floors(tmp_path, shell):
-    tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
+    tables = [lap_rows(1, 0.0), lap_rows(2, 40.0), lap_rows(3, 0.0)]
     store = write_store(tmp_path / "store", tables)
     names = [table["recording_id"][0].as_py() for table in tables]
     first = survey(store, recording=names[0])
