@@ -1,4 +1,4 @@
-"""Every variant of the learner on a corridor of four states, whose values are known."""
+"""Check the learner on a corridor of four states whose optimal values are known."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ STATES, GAMMA = 4, 0.9
 
 
 def corridor() -> tuple[torch.Tensor, np.ndarray]:
-    """Packed rows (8, 11) of every state and action, and the optimal values (4, 2)."""
+    """Return packed rows (8, 11) of every state and action, and the optimal values (4, 2)."""
     rows, q = [], np.zeros((STATES, 2))
     following, reward, discount = (np.zeros((STATES, 2)) for _ in range(3))
     for state in range(STATES):
@@ -57,7 +57,7 @@ def test_values_agree_with_value_iteration(settings: dict[str, object]) -> None:
 
 def test_margin_makes_expert_action_greedy() -> None:
     rows, _ = corridor()
-    backs = rows[:, 2 * STATES] == 0  # an expert who goes back
+    backs = rows[:, 2 * STATES] == 0  # the expert always goes back
     values = learn_values(config(loss__margin=5.0), logged=len(rows), expert=backs)
     assert (values.argmax(axis=1) == 0).all()
     none = learn_values(

@@ -1,4 +1,4 @@
-"""A training loop of one's own on a table of any task: its record, comparison and diagnosis."""
+"""Record, compare and diagnose a custom training loop on a table of any task."""
 
 from collections import Counter
 from pathlib import Path
@@ -26,7 +26,7 @@ SETTINGS = {"target": {"rule": "polyak", "tau": 0.005}}
 
 @pytest.fixture(scope="module")
 def panels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Panel]:
-    """Return panels of one table, of which a tenth is rare: half of a batch, or by its share."""
+    """Return two panels of one table with a tenth of rare rows: drawn by quota and uniformly."""
     rng, rows = np.random.default_rng(0), []
     for episode in range(50):
         for step in range(8):
@@ -44,7 +44,7 @@ def panels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Panel]:
 
 
 def train_on_panel(panel: Panel, run: Path, *, seed: int = 0, **options: Any) -> list[np.ndarray]:
-    """Draw 30 batches as a loop would, with three evaluations; return their observations."""
+    """Draw 30 batches with three evaluations, as a training loop; return their observations."""
     given = {"audit_share": 1.0, "log_every": 7, "settings": SETTINGS} | options
     buffer = MixtureReplayBuffer(100, *SPACES, "cpu", panel=panel, run=run, seed=seed, **given)
     buffer.critic = lambda batch: (batch.rewards * 0 + 1, batch.rewards * 0 + 0.1)
@@ -112,7 +112,7 @@ def test_runs_fed_differently_are_incomparable(panels: dict[str, Panel], tmp_pat
 def test_fresh_steps_take_condition_from_info(panels: dict[str, Panel], tmp_path: Path) -> None:
     options = {"run": tmp_path / "run", "logs_share": 0.5, "log_every": 5}
     buffer = MixtureReplayBuffer(60, *SPACES, "cpu", panel=panels["quotas"], **options)
-    names = ["nominal", "rare", "rare", "wet", None, "nominal"]  # a condition an episode
+    names = ["nominal", "rare", "rare", "wet", None, "nominal"]  # one condition per episode
     for name in names:
         for step in range(4):
             seen = np.full((1, 3), step, np.float32)

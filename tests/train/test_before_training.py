@@ -1,4 +1,4 @@
-"""Rows are diagnosed before training: consistent mistakes are named, sound rows are left alone."""
+"""Diagnose rows before training: planted faults are named, sound rows are healthy."""
 
 import json
 import re
@@ -47,7 +47,7 @@ Plant = Callable[[FedRows], FedRows]
 
 @pytest.fixture(scope="module")
 def logs() -> FedRows:
-    """Return what sound logs look like: the twin's, of other episodes than the twin's own."""
+    """Return sound logs: episodes of the twin with another seed than the `twin` fixture."""
     return _drive(seed=7)
 
 
@@ -62,14 +62,14 @@ def _drive(seed: int) -> FedRows:
 
 
 def _mirror_turns(rows: FedRows) -> FedRows:
-    """Left and right exchanged wherever an action stands, in the observations too."""
+    """Exchange left and right in actions and in the previous actions of observations."""
     table = [tuple(action) for action in rows.task.actions]
     other = np.array([table.index((speed, -turn if turn else turn)) for speed, turn in table])
     return _set_actions(rows, other[rows.action])
 
 
 def _set_actions(rows: FedRows, action: Ints) -> FedRows:
-    """Other actions (N,) in the logs: observations hold them too."""
+    """Replace actions (N,), also as previous actions in observations."""
     first, count = rows.task.observation_names.index("previous_action_0"), len(rows.task.actions)
     held, before = np.eye(count, dtype=np.float32)[action], rows.joined.nonzero()[0]
     observation, after = rows.observation.copy(), rows.next_observation.copy()
@@ -84,7 +84,7 @@ def _delay_actions(rows: FedRows) -> FedRows:
 
 
 def _change_entries(rows: FedRows, change: Callable[..., None], *names: str) -> FedRows:
-    """Return rows whose observations are changed; `change` gets one and the places of `names`."""
+    """Apply `change` to the observations; it also gets the column indices of `names`."""
     places = [rows.task.observation_names.index(name) for name in names]
     made = [rows.observation.copy(), rows.next_observation.copy()]
     for held in made:
@@ -125,7 +125,7 @@ def _repeat_episodes(rows: FedRows, from_step: int = 0) -> FedRows:
 
 
 def _change_lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
-    """Return rows with other clearances (N, S) in m, of which entries are roots."""
+    """Apply `change` to clearances (N, S) in m, which observations hold as square roots."""
     first = rows.task.observation_names.index("clearance_-175deg")
     most, count = rows.task.range_max_m, rows.task.sectors
 
@@ -143,7 +143,7 @@ def _change_lidar(rows: FedRows, change: Callable[..., Any]) -> FedRows:
 
 
 def _cut_episodes(rows: FedRows) -> FedRows:
-    """Return episodes without their last second, stored as terminated there."""
+    """Cut the last second of each episode and mark its new end as terminated."""
     following, known = rows.before(-5)
     cut = rows.take(known & (rows.episode[following] == rows.episode))
     return replace(cut, terminated=cut.last)
@@ -196,7 +196,7 @@ def test_planted_fault_is_named(logs: FedRows, twin: FedRows, fault: str) -> Non
     plant, cause = PLANTED[fault]
     for against in (twin, None):
         if against is None and cause in ("LIDAR_SCALED", "SENSOR_BIASED"):
-            continue  # nothing else in the rows gives a distance, or a zero
+            continue  # without a twin, the rows contain no reference for a distance or a zero
         found = diagnose_rows(plant(logs), against, "there is none")
         assert found.verdict == "BUFFER"
         assert found.findings[0].cause.startswith(cause)
@@ -234,7 +234,7 @@ def test_mirrored_needs_interval_below_zero(high: float, named: str) -> None:
     ],
 )
 def test_fault_of_one_robot_names_its_recordings(kind, tagged, part, logs, twin):
-    """Check that a fault in a third of the rows is named by tag or by when it drove."""
+    """Check that a fault in a third of the rows names the robot's tag or its recordings."""
     owner = logs.episode % 3
     third = np.array([f"r{one}" for one in owner])
     fleet = replace(logs, recording=third, logged_ns=1_000 * owner + logs.episode)
@@ -310,7 +310,7 @@ def test_fault_of_one_robot_is_the_only_finding(logs, twin, fault):
 
 
 def _change_series(rows: FedRows, name: str, change: Callable[..., Any]) -> FedRows:
-    """Return rows with an entry changed row by row: next observations keep to the rows after."""
+    """Change one entry over time, and next observations accordingly."""
     at = rows.task.observation_names.index(name)
     observation, after = rows.observation.copy(), rows.next_observation.copy()
     observation[:, at] = change(observation[:, at])
@@ -333,7 +333,7 @@ def _repeat_at_ends(rows: FedRows) -> FedRows:
 
 
 def _copy_command(rows: FedRows) -> FedRows:
-    """Report the command as the wheels' speed, after the step and before the next one."""
+    """Replace the wheel speed by the command, in observations and next observations."""
     at = rows.task.observation_names.index("wheel_speed")
     observation, after = rows.observation.copy(), rows.next_observation.copy()
     after[:, at] = rows.command()[:, 0]
@@ -343,13 +343,13 @@ def _copy_command(rows: FedRows) -> FedRows:
 
 
 def _hold_wrong_values(rows: FedRows) -> FedRows:
-    """Hold a gyroscope for four steps, at values of other rows."""
+    """Hold each gyroscope value for four steps, with values of other rows."""
     row = np.arange(len(rows)) // 4 * 4
     read = _change_series(rows, "gyro_yaw_rate", lambda one: np.roll(one, 99)[row])
     for wrong, right in ((read.observation, rows.observation),
                          (read.next_observation, rows.next_observation)):  # fmt: skip
         gyro, slip = map(rows.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
-        wrong[:, slip] += right[:, gyro] - wrong[:, gyro]  # the wheels turn as they did
+        wrong[:, slip] += right[:, gyro] - wrong[:, gyro]  # the wheels are unchanged
     return read
 
 
@@ -358,7 +358,7 @@ def _drop_returns(seen: Any) -> Any:
 
 
 def _cut_at_new_goals(rows: FedRows) -> FedRows:
-    """Cut a robot's episodes at their end; the next one goes on in the next step."""
+    """Make episodes of one robot end as truncated, with the next one a step later."""
     begins = (1 + np.cumsum(rows.robot == "r1")) * round(1e9 * rows.task.control_period_s)
     return replace(rows, logged_ns=begins, terminated=rows.terminated & False,
                    truncated=rows.last)  # fmt: skip
@@ -438,7 +438,7 @@ def test_partial_fault_is_found_beside_other_robots(logs, twin, fault, monkeypat
 
 
 def test_proposals_are_compared_in_observation_units(logs: FedRows) -> None:
-    """A robot of a quarter of the speed does the same, as observations are in units of that."""
+    """Compare with a robot of a quarter of the speed, since observations are scaled by speed."""
     slow = tuple((speed / 4, turn / 4) for speed, turn in logs.task.actions)
     driven = replace(logs, driver=np.full(len(logs), "planner"))
     shares = [
@@ -489,7 +489,7 @@ def test_moved_racks_are_reported(tuesday):
 def test_unpursued_goals_are_not_a_scaled_plan(tuesday):
     rows = tuesday.rows
 
-    def away(held: Any, place: int) -> None:  # the robot drives away from them
+    def away(held: Any, place: int) -> None:  # the robot drives away from its goal
         held[rows.episode % 2 == 0, place] = 0.95 - held[rows.episode % 2 == 0, place]
 
     found = diagnose_rows(_change_entries(rows, away, "goal_distance"), None)
@@ -501,7 +501,7 @@ def test_unpursued_goals_are_not_a_scaled_plan(tuesday):
 
 @pytest.mark.parametrize("failed", [0.0, 1.0])
 def test_conditions_chosen_by_outcome_are_reported(logs, failed):
-    """Check the selection bias of near collisions that are kept only if they ended badly."""
+    """Check the selection bias if near collisions are kept only when they end in failure."""
     near = logs.episode % 3 == 0
     held = np.empty(len(logs), object)
     held[:] = [({"near_collision"} if one else set(), {"closing_traffic"}) for one in near]
@@ -513,7 +513,6 @@ def test_conditions_chosen_by_outcome_are_reported(logs, failed):
 @pytest.mark.long
 @pytest.mark.parametrize("logged", ["ice", "random driver"])
 def test_ice_and_random_driving_are_not_faults(twin, logged, monkeypatch):
-    """Check that ice and aimless driving are not named as faults of a sensor."""
     if logged == "ice":
         monkeypatch.setattr(fed_rows, "KINDS", ("nominal", "wheel_slip"))
     else:
@@ -529,7 +528,7 @@ def test_few_rows_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
 
 
 def test_small_spread_in_one_episode_is_undecided(logs: FedRows, twin: FedRows) -> None:
-    """An ideal simulator, or a floor on which nothing happens: its sensors are not at fault."""
+    """Accept sensors with little noise, as of an ideal simulator or an empty floor."""
     place = logs.task.observation_names.index
     still = logs.observation.copy()
     still[:, place("lateral_speed")] *= 0.001
@@ -551,7 +550,7 @@ def test_small_spread_in_one_episode_is_undecided(logs: FedRows, twin: FedRows) 
 def test_diagnose_reports_findings_for_noise(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rows of pure noise: nothing follows from anything, and 'what' is said with its evidence."""
+    """Diagnose rows of pure noise."""
     store = write_store(tmp_path / "store", [recording_transitions(index) for index in (1, 2)])
     words = ["diagnose", str(store), "--no-twin"]
     profile = tmp_path / "profile.toml"
@@ -618,7 +617,7 @@ def test_labels_unknown_in_hindsight_are_not_checked(tmp_path: Path) -> None:
 
 
 def test_panel_is_compared_with_its_store(tmp_path: Path) -> None:
-    """What was changed after mixing is what the critic is fed, and the store does not show it."""
+    """Report changes made after mixing: the critic is fed them, and the store lacks them."""
     profile = load_profile("warehouse_amr")
     ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
     panel = panel_of(tmp_path / "store", EVERY + NO_SPLIT, tmp_path / "panel")
@@ -641,7 +640,7 @@ def test_panel_is_compared_with_its_store(tmp_path: Path) -> None:
 
 
 def _rewrite_panel(panel: Panel, **columns: list[Any]) -> None:
-    """Other software's doing: columns of `meta`, and a seal that agrees with them."""
+    """Replace columns of `meta` and seal the panel again, as other software could."""
     path, header = panel.path / META, panel.path / HEADER
     meta = replaced(panel.meta, columns)
     path.unlink()

@@ -56,7 +56,7 @@ TUESDAY, MONDAY = str(ROOT / "sample_logs/amr_tuesday"), str(ROOT / "sample_logs
 
 
 def ingest_with_profile(folder: Path, name: str, recording: str, store: Path) -> None:
-    """By a profile of this name, whose files are gone afterwards."""
+    """Ingest with a profile of this name, then delete the profile's files."""
     profile = folder / f"{name}.toml"
     profile.write_text(SHORTER.replace('name = "warehouse_amr"', f'name = "{name}"', 1) + OWN)
     (folder / "creeping.sql").write_text(CREEPING)
@@ -67,7 +67,7 @@ def ingest_with_profile(folder: Path, name: str, recording: str, store: Path) ->
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a store, its panel and a run of it, by a profile whose files are gone."""
+    """Return a folder of a store, its panel and a run, made with a profile that was deleted."""
     folder = tmp_path_factory.mktemp("carried")
     ingest_with_profile(folder, "mine", TUESDAY, folder / "store")
     assert main(["mix", str(folder / "store"), "--out", str(folder / "panel")]) == 0
@@ -77,7 +77,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def panel_with_profile(folder: Path, text: str) -> Panel:
-    """Return that panel with another text of its profile."""
+    """Return the folder's panel with this profile text."""
     panel = Panel.open(folder / "panel")
     header = msgspec.structs.replace(panel.header, profile_toml=text)
     return Panel(panel.path, header, panel.rows)
@@ -105,13 +105,13 @@ def test_eval_and_resume_work_without_profile_file(folder, shell):
     assert "battery_v" in page
     resumed = prepare_resumed(folder / "run", ["schedule.env_steps=410"])
     assert resumed.profile.name == "mine"
-    # The run's config names the profile as the panel does: its settings make the same run again.
+    # The settings of the run's config reproduce it with the panel's profile.
     again = prepare_new(folder / "again", folder / "panel", None, [*TINY, "profile=mine"])
     assert again.profile == resumed.profile
 
 
 def test_run_lists_conditions_the_twin_cannot_show(folder, shell):
-    """What the twin's own signals say is evaluated there; logs keep their stored labels."""
+    """Evaluate conditions of twin signals in the twin; logs keep their stored labels."""
     line = ["train", "--panel", str(folder / "panel"), "--out", str(folder / "dry"), *FLAGS]
     out, err = shell.printed(*line, "--dry-run")
     assert err.count("condition 'sagging' is not evaluated in the twin") == 1

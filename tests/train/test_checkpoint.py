@@ -1,4 +1,4 @@
-"""Checkpoints: exact, atomic, and nothing in them that executes."""
+"""Check that checkpoints are exact and atomic, and that damaged files are reported."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The way the logs were driven, as a policy: how good a clone it is, and what it is refused for."""
+"""Clone the drivers of the logs as a policy: quality, caching and rejections."""
 
 import json
 from pathlib import Path
@@ -24,12 +24,12 @@ ACTIONS = len(TASK.actions)
 
 @pytest.fixture(autouse=True)
 def few_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clone by few updates, as what is learnt here is easy."""
+    """Clone with few updates, since the drivers of these tests are simple."""
     monkeypatch.setattr(policies, "UPDATES", (50, 100))
 
 
 def rows_of_rule_driver(recording: int, who: str, *, chance: bool = False) -> pa.Table:
-    """Rows whose driver turns by the side on which the near waypoint is, or by chance."""
+    """Return rows whose driver turns toward the near waypoint, or at random."""
     table = recording_transitions(recording, task=TASK)
     rng = np.random.default_rng(recording)
     observation = np.zeros((len(table), TASK.observation_size), np.float32)

@@ -1,4 +1,4 @@
-"""Which logged rows are cloned: those of named drivers, and others' successful episodes."""
+"""Select the logged rows to clone: named drivers and successful episodes of other drivers."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from restock.train.feed.logs import Coded
 from restock.train.feed.teacher import rows_of_policies, rows_of_successes, select_cloned
 from restock.train.prepare import prepare_new
 
-# An episode a line: who drove its steps, and how it ended.
+# Drivers of each step and the end of each episode.
 EPISODES = {
     "planner's own": (["planner"] * 3, "goal"),
     "helped": (["planner", "operator", "planner"], "goal"),
@@ -88,7 +88,7 @@ def test_run_reports_cloned_rows_and_updates(panel: Panel, tmp_path: Path) -> No
     misspelt = [*logged, "teacher.policies=['operator', 'plannner']"]
     text = describe_run(prepare_new(tmp_path / "run", panel.path, None, misspelt))
     assert "rows of operator (none of plannner: the panel has operator, planner)" in text
-    # 2,000 updates of the critic; as many again for each 5,000 rows.
+    # The critic's 2,000 offline updates, scaled by rows / 5,000.
     assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
     fewer = prepare_new(
         tmp_path / "run", panel.path, None, [*logged, "schedule.offline_updates=100"]

@@ -1,4 +1,4 @@
-"""What the collector puts into the ring is what the twin returned, step by step."""
+"""Compare the rows in the ring with the steps that the twin returned."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ ENVS, LONGEST = 3, 25
 
 
 def make_collector(n_step: int) -> Collector:
-    """Return a collector of short episodes that all go on to the time limit."""
+    """Return a collector of short episodes that all end at the time limit."""
     profile = load_profile("warehouse_amr")
     task = msgspec.structs.replace(profile.task, time_limit_steps=LONGEST, bump_terminates=False)
     ring = FreshRing(
@@ -33,7 +33,7 @@ def make_collector(n_step: int) -> Collector:
 
 
 def test_truncated_episodes_bootstrap_at_last_step():
-    """The ring's rows of three steps against the single steps that the twin returned."""
+    """Compare three-step rows of the ring with the single steps of the twin."""
     made, rng = make_collector(n_step=3), np.random.default_rng(0)
     step_of: dict[tuple[int, int], tuple[Any, ...]] = {}
     for number in range(2 * LONGEST):
@@ -42,7 +42,7 @@ def test_truncated_episodes_bootstrap_at_last_step():
         after, reward, terminated, truncated, info = returned
         assert not terminated.any()
         assert truncated.all() == truncated.any() == (number % LONGEST == LONGEST - 1)
-        after = info["final_obs"] if truncated.any() else after  # not the next episode's first
+        after = info["final_obs"] if truncated.any() else after  # before the reset
         for env in range(ENVS):
             step_of[env, number] = before[env], action[env], reward[env], after[env].copy()
         made.finish(env_steps=number * ENVS, gradient_steps=0, acting_step=0)

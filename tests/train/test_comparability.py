@@ -1,4 +1,4 @@
-"""The gate: what was fed alike passes, what was planted is found, and noise is called noise."""
+"""Check feed comparison: equal feeds pass, planted differences are found."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ def feed(
     runs: int = 1,
     weight: tuple[float, ...] = (1, 1, 1, 1, 1),
 ) -> Feed:
-    """Half from logs in exact quotas, half fresh: each fresh episode has one condition."""
+    """Return a feed of half logged rows in exact quotas and half fresh rows."""
     rng = np.random.default_rng(seed)
     parts = []  # cell, tenth, episode, run, drawn
     for number, part in np.ndindex(runs, 10):
@@ -58,7 +58,7 @@ def test_feed_is_not_incomparable_with_itself() -> None:
 
 
 def test_few_episodes_of_one_process_are_inconclusive() -> None:
-    # Many rows of few episodes: a test that counts rows would call nearly all of these different.
+    # Many rows of few episodes: a test that counts rows would reject nearly all pairs.
     verdicts = [
         verdict(feed(seed, fresh_episodes=150), feed(seed + 100, fresh_episodes=150))
         for seed in range(12)
@@ -82,7 +82,7 @@ FEW = {f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")}
     ("planted", "least", "most"),
     [
         ({"slip": 0.5}, {"mix", "share of fresh/wheel_slip"}, None),
-        ({"weight": (1, 0.2, 1, 1, 1)}, {"mix after weights"}, None),  # which undo a boost
+        ({"weight": (1, 0.2, 1, 1, 1)}, {"mix after weights"}, None),  # weights that undo a boost
         ({"log_episodes": 40}, FEW, FEW),
     ],
 )

@@ -1,4 +1,4 @@
-"""`restock compare`: what may be compared, what is refused and why, and who did better."""
+"""Check `restock compare`: comparable and incomparable runs, differences and intervals."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def test_algorithms_with_equal_feeds_are_compared(tmp_path, capsys) -> None:
         "config__network__layer_norm": False,
         "update_path": "autograd",
         "next_value": "lower of both networks",
-    }  # one follows the other
+    }  # next_value follows from update_path
     second = arm(tmp_path, "b", range(3, 6), success=0.7, **other)
     code, found = compared(capsys, first, second)
     assert (code, found["verdict"], found["outcomes_from"]) == (0, "comparable", "training")
@@ -136,7 +136,7 @@ def test_few_episodes_are_inconclusive(tmp_path, capsys) -> None:
     ],
 )
 def test_few_runs_or_episodes_give_no_interval(tmp_path, capsys, seeds, episodes, why) -> None:
-    given = {"episodes": episodes, "fresh_episodes": 400}  # of a feed that may differ
+    given = {"episodes": episodes, "fresh_episodes": 400}  # feeds may differ under this treatment
     first = arm(tmp_path, "a", range(seeds), success=2.0, **given)
     second = arm(tmp_path, "b", range(3, 3 + seeds), success=-1.0, **given)
     code, found = compared(capsys, first, second, "--treatment", "mixture")

@@ -1,4 +1,4 @@
-"""The configuration of a run: unknown, renamed and out-of-range values are refused by their key."""
+"""Check that invalid configuration values are reported by their key."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Contrasts of a study: measures of runs, paired by seed; and what so many seeds can see."""
+"""Check the contrasts of a study, which pair the measures of runs by seed."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ name = "quotas"
 
 
 def write_curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True) -> Path:
-    """Return a finished run whose slipping missions succeed so often (tens) at each evaluation."""
+    """Write a run with these success rates on slippery missions, keyed by environment step."""
     run = Run.create(path, document(seed))
     for step, share in success.items():
         for cell, of in ((("nominal", "none"), 1.0), (("wheel_slip", "none"), share)):
@@ -61,7 +61,7 @@ def test_area_lies_between_min_and_max(values: list[float], level: float) -> Non
 
 def test_partial_and_full_blocks_weigh_equally(tmp_path: Path) -> None:
     run = RunCurve(write_curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}))
-    assert run.value("auc_blocked_aisle") == 0.5  # one partly blocked, three wholly
+    assert run.value("auc_blocked_aisle") == 0.5  # one partial block, three full blocks
     assert run.value("auc_partly_blocked") == 0.0
     assert run.value("auc_rare") == pytest.approx((0.6 + 0.5) / 2)
     assert np.isnan(run.value("success_rare"))  # `restock eval` has not driven it
@@ -105,12 +105,12 @@ def test_holm_adjusts_all_but_primary_contrast(tmp_path: Path) -> None:
     assert first.high is not None
     assert first.low < 0.15 < first.high
     assert first.p_holm is None
-    assert [one.measure for one in others] == ["auc_rare", "auc_nominal"]  # nothing at the end
+    assert [one.measure for one in others] == ["auc_rare", "auc_nominal"]  # no final evaluation
     assert others[0].p is not None
     assert others[0].p_holm == pytest.approx(others[0].p)  # the other has no p
-    assert (others[1].difference, others[1].p_holm) == (0.0, None)  # it never differed
+    assert (others[1].difference, others[1].p_holm) == (0.0, None)  # all differences are 0
     assert others[1].no_interval == "the same in every seed: nothing varies"
-    assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
+    assert contrasts(plan, {("quotas", "uniform")}) == []  # the comparison was refused
 
 
 def evaluation_episodes(policy: str, success: float, time_s: float) -> pa.Table:
@@ -144,7 +144,11 @@ def test_study_page_lists_contrasts_and_safety(tmp_path: Path) -> None:
     assert rows["quotas"]["success wheel_slip"][0] == pytest.approx(0.75)
     assert rows["uniform"]["bumps_per_km"][0] == pytest.approx(80.0)  # 16 in 200 m
     assert rows["quotas"]["time_lost_s"][0] == pytest.approx(2.0)
-    assert rows["planner"]["success wheel_slip"] == [0.5, None, None]  # one policy: no seeds
+    assert rows["planner"]["success wheel_slip"] == [
+        0.5,
+        None,
+        None,
+    ]  # a single policy
     html = write_page(study_page(found), tmp_path / "study.html", markdown=True).read_text("utf-8")
     assert "Treatment: mixture; what differs: replay.logs_share." in html
     assert " | 0.750 | 0.200 | 3 |" in (tmp_path / "study.md").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`restock diagnose`: planted symptoms are named for what they are, and never forced."""
+"""Check that `restock diagnose` finds planted symptoms and stays undetermined without evidence."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ def make_run(
     target: TargetRule = Polyak(),  # noqa: B008  (frozen)
     seed: int = 0,
 ) -> Run:  # fmt: skip
-    """Make a run whose evaluations show these figures, as training writes them."""
+    """Write a run whose tables contain these symptoms, in the form that training writes."""
     config = msgspec.to_builtins(TrainConfig(target=target, seed=seed))
     run = Run.create(path, {"config": config, "panel": None})
     for window in range(1, windows + 1):
@@ -77,7 +77,7 @@ def make_run(
 
 
 def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> None:
-    """Append a row of which all that is not given is null."""
+    """Append a row whose other columns are null."""
     run.append(table, [{**dict.fromkeys(run.table(table).schema.names), **clocks, **values}])
 
 
@@ -86,34 +86,37 @@ def append(run: Run, table: str, clocks: Mapping[str, int], **values: Any) -> No
     [
         ({}, "HEALTHY"),
         ({"gap": {"blocked_aisle": 6.0}}, "BUFFER"),
-        # TD errors of a few episodes say little; that replay lacks them says all.
+        # A condition missing from replay is a symptom even with few held-out rows.
         ({"gap": {"blocked_aisle": 6.0}, "held_out": {"blocked_aisle": 100}}, "BUFFER"),
         ({"shares": {**SHARES, "blocked_aisle": 0.0}, "held_out": {"blocked_aisle": 30}}, "BUFFER"),
         ({"shares": {n: s for n, s in SHARES.items() if n != "blocked_aisle"}}, "BUFFER"),
         ({"shares": {**SHARES, "blocked_aisle": 0.02}}, "HEALTHY"),
         ({"agreement": {"blocked_aisle": 0.03}}, "BUFFER"),
         ({"unexplained": {"blocked_aisle": 1.2}}, "BUFFER"),
-        ({"unexplained": dict.fromkeys(CONDITIONS, 1.2)}, "HEALTHY"),  # a noisy robot is no fault
+        (
+            {"unexplained": dict.fromkeys(CONDITIONS, 1.2)},
+            "HEALTHY",
+        ),  # a noisy robot
         ({"clock": 8.0}, "TARGET"),
         ({"gap": 7.0}, "TARGET"),
         ({"q_abs_max": 149.0}, "HEALTHY"),
         ({"q_abs_max": 151.0}, "DIVERGENCE"),  # 1.5 / (1 - .99)
         ({"q_abs_max": 32.0, "driven": 11.0}, "HEALTHY"),
-        ({"q_abs_max": 34.0, "driven": 11.0}, "DIVERGENCE"),  # three times what an episode gave
+        ({"q_abs_max": 34.0, "driven": 11.0}, "DIVERGENCE"),  # three times the return of an episode
         ({"explained": 0.01}, "DIVERGENCE"),
-        # Robots that stand give targets that hardly vary, and a share of any size below 0.
+        # Targets of standing robots hardly vary, so their explained share may be far below 0.
         ({"explained": {"nominal": 0.7, "blocked_aisle": -9.0}, "held_out": FEW}, "HEALTHY"),
         ({"explained": {"nominal": 0.1, "blocked_aisle": 0.1}, "held_out": FEW}, "DIVERGENCE"),
         ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
-        ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
+        ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # absent in the last window
         ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag
-        # So does that of a young run's last windows: any target lags while values grow from 0.
+        # Every target lags while values grow from 0, so a young run is undetermined.
         ({"every": 400, "lags": (0.9, 0.6, 0.4, 0.3)}, "UNDETERMINED"),
         ({"every": 600, "lags": (0.9, 0.6, 0.4, 0.3)}, "TARGET"),
         ({"every": 325, "lag": 0.4, "target": Polyak(tau=0.02)}, "TARGET"),
-        ({"every": 325, "gap": 7.0}, "TARGET"),  # age excuses a lag alone
+        ({"every": 325, "gap": 7.0}, "TARGET"),  # a young run excuses only the lag
         ({"every": 1300, "lags": (0.9, 0.6, 0.4, 0.3), "target": Hard(1000)}, "TARGET"),
-        # No run is old enough for a target that hardly moves, and L does not fall.
+        # A target that hardly moves is at fault even in a young run, since L does not fall.
         ({"every": 450, "lag": 1.1, "target": Hard(1_000_000)}, "TARGET"),
         ({"every": 450, "lags": (1.2, 1.15, 1.1, 1.0), "target": Polyak(tau=3e-5)}, "TARGET"),
     ],
@@ -192,7 +195,7 @@ def test_confirm_does_not_overwrite_a_run(tmp_path: Path, capsys) -> None:
     run = str(make_run(tmp_path / "r", lag=0.9).path)
     assert main(["diagnose", run, "--confirm", run]) == 2
     shown = capsys.readouterr()
-    assert not shown.out  # refused before anything else
+    assert not shown.out  # rejected before the diagnosis
     error = " ".join(shown.err.split())
     assert "already exists give --confirm another directory" in error
     assert "--out" not in error
@@ -200,7 +203,7 @@ def test_confirm_does_not_overwrite_a_run(tmp_path: Path, capsys) -> None:
 
 @pytest.mark.parametrize("source", ["none", "planner"])
 def test_confirm_repeats_run_without_operator_teacher(source, tmp_path, monkeypatch):
-    """Its config has the other settings of `teacher`, resolved, which nobody may give."""
+    """Repeat a config whose resolved `teacher` settings would be rejected as user input."""
     run = make_run(tmp_path / "r", lag=0.9)
     run.document["config"]["teacher"] |= {"source": source, "successes": False, "ratio": 0.2}
     run.document["panel"] = None
@@ -219,8 +222,8 @@ def test_confirm_repeats_run_without_operator_teacher(source, tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("after", "cause", "confirmed"),
     [
-        ({"lag": 0.9}, "TARGET", False),  # another target rule, and the target is at fault again
-        ({"gap": {"blocked_aisle": 6.0}}, "BUFFER", True),  # what else is at fault is left
+        ({"lag": 0.9}, "TARGET", False),  # the target is at fault under another rule too
+        ({"gap": {"blocked_aisle": 6.0}}, "BUFFER", True),  # the other fault remains
         ({"windows": 2}, "UNDETERMINED", None),
     ],
 )

@@ -1,4 +1,4 @@
-"""`restock eval`: what is asked of it is checked, by name, before anything is driven."""
+"""Check `restock eval`: arguments, recorded episodes and references."""
 
 import json
 from pathlib import Path
@@ -98,10 +98,10 @@ def test_time_lost_is_relative_to_planner(tmp_path, shell):
 
     planner = results("planner")["planner", "nominal"]
     assert planner["time_lost_s"] == 0.0
-    operator = results("operator")["operator", "nominal"]  # against the planner of before
+    operator = results("operator")["operator", "nominal"]  # relative to the recorded planner
     assert operator["success"] == 1.0
     assert operator["time_lost_s"] == pytest.approx(operator["time_s"] - planner["time_s"])
-    # Who drove before the planner did is told as well, now that it is known.
+    # Episodes recorded before the planner drove get their lost time too.
     assert main([*line, "--policies", "random"]) == 0
     alone = {(row["policy"], row["condition"]): row for row in read_evaluations(run).to_pylist()}
     assert alone["operator", "nominal"]["time_lost_s"] == operator["time_lost_s"]
@@ -123,7 +123,7 @@ def test_episodes_per_kind(tmp_path, shell):
 
 
 def test_seeds_that_selected_the_policy_are_warned_about(tmp_path: Path) -> None:
-    run = kept_run(tmp_path / "a")  # its evaluation's seeds are 90000 to 90009
+    run = kept_run(tmp_path / "a")  # its evaluation seeds are 90000 to 90009
     assert plan_evaluation(run, episodes=1000).warnings == []
     assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []
     (text,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
@@ -142,7 +142,7 @@ def test_limiter_interventions_are_counted(tmp_path, shell):
     assert limited["policy"] == "limited:planner"
     assert 0 < limited["limited_share"] <= 1
     assert limited["time_s"] > free["time_s"] * 1.2
-    # Other limits are another driver: the newest is what is shown.
+    # Other limits count as another driver, and the newest is shown.
     assert main([*line, "profile"]) == 0
     shown = shown_evaluation(run)[0].to_pylist()
     assert sorted(row["policy"] for row in shown) == ["limited:planner"] * 2 + ["planner"] * 2

@@ -1,4 +1,4 @@
-"""Evaluation: the same episodes for everyone, in the order asked, whatever the number of envs."""
+"""Check evaluation: fixed episodes, results in order, and summaries."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 
 
 class ConstantPolicy:
-    """Takes one action, always."""
+    """Policy that always takes the same action."""
 
     name, version = "always", "1"
 
@@ -47,7 +47,7 @@ SPECS = fixed_episodes(["nominal", "wheel_slip"], 7, 100)
 def test_results_do_not_depend_on_num_envs() -> None:
     alone = drive(ToyTwin(1), 1, SPECS)
     assert alone == drive(ToyTwin(4), 1, SPECS) == drive(ToyTwin(64), 1, SPECS)
-    assert len({result.time_s for result in alone}) > 2  # slipping ones take longer, each its own
+    assert len({result.time_s for result in alone}) > 2  # slipping episodes take different times
 
 
 def test_episode_result_matches_hand_calculation() -> None:
@@ -127,7 +127,7 @@ def test_bump_rate_is_per_kilometre() -> None:
     assert row["bumps_per_km"] == pytest.approx(0.5)
     assert row["bumps_per_km_low"] <= 0.5 <= row["bumps_per_km_high"]
     assert (row["closest_person_least_m"], row["episodes_with_people"]) == (0.2, 1)
-    # Two kilometres without a bump do not show that there will never be one.
+    # Two kilometres without a bump do not prove a rate of 0.
     clean = measure([far, make_result(3, True, 9.0, distance_m=500.0)])
     assert (clean["bumps_per_km"], clean["bumps_per_km_low"]) == (0.0, 0.0)
     assert clean["bumps_per_km_high"] == pytest.approx(3.689 / 2, abs=1e-3)

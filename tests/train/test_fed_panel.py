@@ -1,4 +1,4 @@
-"""A run is judged, reported and evaluated with the panel that it was fed, or not at all."""
+"""Check that a run is evaluated only with the panel that it was fed."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Films of an evaluation: an episode driven again is the recorded one, or it is not shown."""
+"""Check films: only episodes that are reproduced exactly are shown."""
 
 import json
 from pathlib import Path
@@ -30,13 +30,13 @@ def test_scenes_are_worst_failures_and_best_rescues() -> None:
         row("wheel_slip", 1, "agent", False, -1.0),
         row("wheel_slip", 2, "agent", False, -3.0),
         row("wheel_slip", 3, "agent", True, 4.0),
-        row("wheel_slip", 4, "agent", True, 5.0),  # the planner arrived, too: no rescue
+        row("wheel_slip", 4, "agent", True, 5.0),  # not a rescue: the planner arrived too
         row("wheel_slip", 3, "planner", False, 0.0),
         row("wheel_slip", 4, "planner", True, 5.0),
         row("blocked_aisle", 5, "agent", True, 1.0),
         row("blocked_aisle", 6, "agent", True, 9.0),
         row("blocked_aisle", 6, "planner", False, 0.0),
-        row("blocked_aisle", 5, "run:out/logs_alone", False, 0.0),  # as before this run
+        row("blocked_aisle", 5, "run:out/logs_alone", False, 0.0),  # an earlier run
         row("nominal", 1, "agent", True, 1.0),
         {**row("nominal", 9, "agent", False, -9.0), "perturbation": "friction"},
     ]
@@ -47,7 +47,7 @@ def test_scenes_are_worst_failures_and_best_rescues() -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run whose policy is nobody's: it fails, with several environments at a time."""
+    """Return an evaluated run with an untrained policy, which fails its episodes."""
     path = kept_run(tmp_path_factory.mktemp("film") / "run")
     plan = plan_evaluation(path, policies=("agent",), episodes=KINDS)
     drive_evaluation(plan)
@@ -66,7 +66,7 @@ def test_repeated_episode_matches_record(run: Path) -> None:
 def test_films_show_only_reproduced_episodes(run, shell):
     table = read_evaluations(run)
     rows = table.to_pylist()
-    for one in rows:  # as if another episode had been recorded
+    for one in rows:  # as if a different episode had been recorded
         if one["condition"] == "blocked_aisle":
             one["time_s"] += 1.0
     pq.write_table(table.from_pylist(rows, schema=table.schema), run / FILE)

@@ -1,4 +1,4 @@
-"""A fresh row's condition, known once its episode has ended, is in every table that has one."""
+"""Check that conditions of fresh rows reach every table once their episodes end."""
 
 from typing import Any
 
@@ -66,7 +66,7 @@ def test_tables_agree_on_drawn_rows(live, table, condition, measure):
         f" FROM {table} WHERE source = 'fresh' AND {measure} > 0 GROUP BY ALL ORDER BY ALL",
     ) == rows(
         live,
-        # An interval is closed every so many updates, and when the run ends.
+        # Intervals end every `every` updates and at the end of the run.
         f"SELECT least(ceil(gradient_step / {every})::BIGINT * {every},"
         " (SELECT max(gradient_steps) FROM progress)) AS gradient_steps,"
         " coalesce(condition, 'unlabelled') AS condition, count(*) AS n"
@@ -98,7 +98,7 @@ def test_actions_table_counts_drawn_and_greedy_actions(live: Session) -> None:
         key = row["source"], row["condition"], row["action"]
         assert row["drawn"] == drawn.get(key, 0)
         assert row["wanted"] == greedy.get(key, 0)
-    # Wheels slip on a forward command only: no other action was ever drawn there.
+    # Wheels slip only on forward commands, so no other action was drawn there.
     slip = [row for row in per_cell if row["condition"] == "wheel_slip"]
     assert {row["name"] for row in slip if not row["drawn"]} == {"stop", TASK.action_names[2]}
     (shares,) = rows(

@@ -1,4 +1,4 @@
-"""Labels from infos alone are those of the signals."""
+"""Compare labels from step infos with labels from whole episodes."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def test_labels_from_infos_match_episode_labels() -> None:
             observation, _, over, cut, info = made.step(action[0])
             ended = over or cut
             labels.step(0, info, ended=ended, key=key)
-            # The command of a step is known when it has been taken.
+            # The command of a step is known after the step.
             for name in ("command_speed_mps", "command_yaw_rate_radps"):
                 rows[-1] = rows[-1] | {name: info["signals"][name]}
             rows.append(info["signals"])

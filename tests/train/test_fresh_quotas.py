@@ -1,4 +1,4 @@
-"""Runs whose quotas are filled with fresh rows: which they are, what is recorded, what is said."""
+"""Check quotas that fresh rows fill: their strata, the record and reported shortfalls."""
 
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ def logs_of(panel: Panel, settings: Any = SETTINGS) -> Logs:
 
 
 def test_quotas_are_filled_from_logs_and_ring(panel: Panel, tmp_path: Path) -> None:
-    """The logged rows bear a small part of the online draws: the ring gives the rest."""
+    """Limit replays so that logged rows supply few online draws and the ring the others."""
     live = run_to_end(tmp_path / "a", SETTINGS, logs=logs_of(panel))
     nominal, slip = [row for row in fed_shares(live.run) if row["stratum"] != "unlabelled"]
     assert nominal["wanted_share"] == slip["wanted_share"] == 0.5
@@ -148,7 +148,7 @@ def test_quotas_are_filled_from_logs_and_ring(panel: Panel, tmp_path: Path) -> N
     audit = live.run.table("audit").to_pylist()
     fresh = [row for row in audit if row["source"] == "fresh"]
     assert {row["stratum"] for row in fresh} >= {"nominal", "wheel_slip"}
-    # Whole episodes: a row of the stratum need not slip itself.
+    # Strata are of whole episodes, so not every row of the slip stratum slips.
     assert {row["condition"] for row in fresh if row["stratum"] == "wheel_slip"} >= {"nominal"}
 
 
@@ -168,7 +168,7 @@ def audit_effective_share(run: Path) -> list[dict[str, Any]]:
 
 
 def test_shortfall_is_reported_after_training(tmp_path: Path) -> None:
-    """Nothing slips in the twin, and few logged rows do."""
+    """Train with few logged rows of wheel slip and none in the twin."""
     rows = recording_transitions(1, task=TOY_TASK, episodes=60)
     text = QUOTAS.replace("max_replays_per_row = 8", "max_replays_per_row = 1")
     text = text.replace("name = 'wheel_slip'\nunit = 'episode'", "name = 'wheel_slip'")
@@ -197,9 +197,9 @@ def test_seconds_budget_includes_evaluations(tmp_path: Path) -> None:
     live.learner.gradient_steps = live.config.record.every_updates
     live.progress.wall_s = 60.0
     assert time_left(live)
-    assert not time_left(live, 0.5)  # the logs' half is over
+    assert not time_left(live, 0.5)  # the offline half is over
     live.progress.evaluation_s = 45.0
-    assert not time_left(live)  # the last evaluation would end after it
+    assert not time_left(live)  # the last evaluation would exceed the budget
     live.close()
 
 
@@ -223,10 +223,10 @@ def test_seconds_budget_uses_measured_speed(panel, tmp_path):
     live.progress.driving_from_s, live.progress.online_from = 10.0, 200
     live.progress.env_steps = 4_200  # 100 a second
     live.plan()
-    assert live.progress.planned_env_steps == pytest.approx(8_200, abs=100)  # this takes time too
+    assert live.progress.planned_env_steps == pytest.approx(8_200, abs=100)  # time passes here too
     assert live.batches.controller is not None
     assert live.batches.controller.planned.end_env_steps == live.progress.planned_env_steps
-    # A run that goes on from a checkpoint has its plan, whatever the machine's speed is now.
+    # A resumed run keeps its plan, whatever the machine's speed is now.
     live.progress.env_steps = 0
     live.collector.reset(0)
     live.save()

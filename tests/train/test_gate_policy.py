@@ -1,4 +1,4 @@
-"""`restock gate`: passes what is shown not to be worse, names where it is, refuses the rest."""
+"""Check the verdicts of `restock gate`, the conditions that it names, and rejected input."""
 
 import json
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def drive_outcomes(monkeypatch: pytest.MonkeyPatch) -> Callable[[Outcome], None]:
-    """Let the twin's episodes end as a function says."""
+    """Replace driving in the twin by a function that returns each episode's success."""
 
     def install(outcome: Outcome) -> None:
         def run_policy(
@@ -49,7 +49,7 @@ def result(spec: EpisodeSpec, success: bool) -> EpisodeResult:
 
 
 def mostly_successful(spec: EpisodeSpec, own: bool) -> bool:
-    """Nine of ten missions succeed, by either."""
+    """Return success for nine of ten missions, the same for both policies."""
     return bool(np.random.default_rng(spec.seed).random() < 0.9)
 
 
@@ -99,7 +99,6 @@ def test_spent_budget_is_inconclusive(run: Path, drive_outcomes: Any) -> None:
 
 
 def test_each_requested_measure_gets_a_verdict(run: Path, drive_outcomes: Any) -> None:
-    """A policy that arrives as often but bumps more fails by bumps alone."""
     drive_outcomes(mostly_successful)
     margins = {"bumps_per_km": 5.0, "time_lost_s": 2.0, "closest_person_m": 0.2}
     plan = plan_gate(run, "planner", margins=margins, conditions=("nominal",), budget=400)
@@ -120,7 +119,7 @@ def test_each_requested_measure_gets_a_verdict(run: Path, drive_outcomes: Any) -
         (["--margins", "stopped_s=1"], "--margins stopped_s"),
         (["--budget", "20"], "--budget"),
         (["--conditions", "nominal,fire"], "--conditions"),
-        (["--seed", "90000"], "--seed"),  # by which the policy was chosen
+        (["--seed", "90000"], "--seed"),  # the seeds that selected the policy
         (["--baseline", "nobody"], "--policies"),
     ],
 )

@@ -1,4 +1,4 @@
-"""`gather_rows` gives the rows, whether compiled or not."""
+"""Check `gather_rows`, compiled and not."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The sums of an interval's rows, beside the same counted row by row."""
+"""Compare the sums of an interval with counts row by row."""
 
 from collections import Counter
 
@@ -41,7 +41,7 @@ def test_ages_are_bucketed_by_powers_of_two(age: np.ndarray) -> None:
 
 
 def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
-    """Rows of 20 different ones, each with its own stratum, condition and action."""
+    """Return draws from 20 rows, each with its own stratum, condition and action."""
     rng = np.random.default_rng(seed)
     row = rng.integers(20, size=rows)
     stratum, condition, action = row % 2, row // 2 % 2, row // 4 % 2  # "unmet" and "stop": never

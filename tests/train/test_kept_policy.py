@@ -1,4 +1,4 @@
-"""Which policy of a run drives: the best that it evaluated, or the latest of an interrupted one."""
+"""Check which policy of a run is kept: the best evaluated, or the latest if interrupted."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +27,7 @@ def train_until(live: Session, stop: Callable[[], bool]) -> Session:
 
 
 def test_run_interrupted_before_evaluation_keeps_latest(tmp_path):
-    """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
+    """Regression: the policy of step 0, from the logs alone, was reported as the result."""
     live = session(tmp_path / "a", config())
     train_until(live, lambda: live.progress.env_steps >= 700)
     run = Run.open(live.run.path)
@@ -46,7 +46,7 @@ def test_run_interrupted_before_evaluation_keeps_latest(tmp_path):
     ("phase", "chosen", "step"), [("offline", "latest", 0), ("warmup", "best", 0)]
 )
 def test_interruption_before_online_learning(phase, chosen, step, tmp_path):
-    """On the logs nothing is evaluated yet; in the warm-up, all that it learned is."""
+    """Keep the latest policy after offline updates, and the evaluated one in the warm-up."""
     live = session(tmp_path / "a", config())
 
     def stop() -> bool:

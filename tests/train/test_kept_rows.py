@@ -1,4 +1,4 @@
-"""Rows of batches as the record keeps them: compiled code and NumPy's write the same columns."""
+"""Compare the recorded rows of compiled code and of NumPy."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ CAPACITY = 50
 
 
 def ring_of(rng: np.random.Generator) -> FreshRing:
-    """Return a ring whose metadata are any numbers."""
+    """Return a ring with random metadata."""
     ring = FreshRing(
         CAPACITY, 1, 4, discount=0.9, n_step=1, conditions=["a", "b"], behaviour_policies=["p"]
     )

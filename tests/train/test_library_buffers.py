@@ -1,4 +1,4 @@
-"""The buffer in a library's training loop: logs by quota and fresh rows, with a record of which."""
+"""Check the buffer in a library's training loop: quotas of logs, fresh rows and the record."""
 
 import hashlib
 import json
@@ -39,7 +39,7 @@ def test_dqn_trains_offline_then_on_half_logs(trained: TrainedBuffer) -> None:
 
 
 def test_nonfinite_loss_stops_and_names_rows(tmp_path):
-    """Where the buffer is told of TD errors; what was recorded before stays whole."""
+    """Report TD errors to the buffer; earlier records stay complete."""
     trained = trained_sb3(tmp_path, 80)
     updates = trained.feed.batches
     with torch.no_grad():
@@ -68,7 +68,7 @@ def test_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
             drawn[row["stratum"]] = drawn.get(row["stratum"], 0) + row["drawn_rows"]
     total = sum(drawn.values())
     for stratum in trained.panel.strata:
-        assert abs(drawn[stratum.name] - stratum.share * total) < 2  # the rounding, twice
+        assert abs(drawn[stratum.name] - stratum.share * total) < 2  # rounding, in both phases
     assert drawn["wheel_slip"] == pytest.approx(0.25 * total, abs=2)
 
 
@@ -82,7 +82,7 @@ def test_audit_rows_identify_their_transitions(trained: TrainedBuffer) -> None:
             opened.sql("SELECT transition_id, primary_condition FROM transitions").fetchall()
         )
     for row in audit:
-        assert row["last_target_sync"] is None  # the library's, unknown to its buffer
+        assert row["last_target_sync"] is None  # the buffer does not know the library's syncs
         assert 0 < row["age_gradient_steps"] <= row["gradient_step"]
         if row["source"] == "logs":
             at = place[row["transition_id"]]

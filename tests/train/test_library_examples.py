@@ -1,4 +1,4 @@
-"""Other libraries train in the twin unchanged: each example in docs/examples runs, shortened."""
+"""Run each example of docs/examples, shortened."""
 
 import importlib.util
 from pathlib import Path
@@ -25,7 +25,7 @@ NEEDS = {
 
 
 def example(name: str) -> Any:
-    """Return an example's module; the test is skipped where its library is not installed."""
+    """Return an example's module; skip the test if its library is not installed."""
     pytest.importorskip(NEEDS[name])
     torch.set_num_threads(1)
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
@@ -85,7 +85,7 @@ def test_custom_task_learns_rare_condition() -> None:
     assert done["rows fed"] == {"nominal": 200 * 64, "rare": 200 * 64}
 
 
-@pytest.mark.long  # its import alone takes seconds
+@pytest.mark.long  # the import takes seconds
 def test_tianshou_dqn() -> None:
     done = example("tianshou_dqn").main(steps=96, num_envs=8)
     assert done["env_steps"] == 96

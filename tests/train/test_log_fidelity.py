@@ -1,4 +1,4 @@
-"""Logged rows with wrong labels, or that do not belong together, are told from good ones."""
+"""Distinguish sound logged rows from rows with wrong labels or wrong next observations."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ CONDITIONS = ["nominal", "wheel_slip", "blocked_aisle"]
 
 
 def rows(rng: np.random.Generator, level: float) -> NDArray[np.float32]:
-    """Packed rows of a linear system that is driven at some level, (ROWS, 2 SIZE + 3)."""
+    """Return packed rows (ROWS, 2 SIZE + 3) of a linear system at this level."""
     observation = rng.normal(level * np.linspace(0, 1, SIZE), 0.3, (ROWS, SIZE))
     action = rng.integers(0, 4, ROWS)
     following = 0.9 * observation + 0.2 * action[:, None] + rng.normal(0, 0.05, (ROWS, SIZE))
@@ -38,7 +38,7 @@ def test_sound_rows_agree_and_are_explained() -> None:
 
 
 def test_agreement_combines_sources() -> None:
-    """An evaluation that shows few of a condition, and a ring that has it."""
+    """Combine an evaluation with few rows of a condition and a ring that has more."""
     logs = LogFidelity(probe(levels(0)), SIZE)
     nominal, slip, blocked = levels(1)
     few = probe([nominal, slip, blocked[:40]])

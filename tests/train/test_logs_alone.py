@@ -1,4 +1,4 @@
-"""`env.twin = false`: a policy from the logs alone, where no twin is worth trusting."""
+"""Train with `env.twin = false`, from the logs alone."""
 
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def test_training_without_twin_keeps_last_policy(panel, tmp_path, monkeypatch, q
     assert run.best.is_file()
     assert not run.table("evaluations").num_rows
     assert run.document["config"]["schedule"]["env_steps"] == 0
-    assert shell.json("train", "--resume", out)["gradient_steps"] == 30  # nothing is left to do
+    assert shell.json("train", "--resume", out)["gradient_steps"] == 30  # already finished
 
     assert main(["eval", str(out), "--on-logs", "own"]) == 0
     assert main(["report", str(out)]) == 0

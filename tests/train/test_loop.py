@@ -1,4 +1,4 @@
-"""The training loop on a corridor: it learns, repeats itself, and resumes bit for bit."""
+"""Check the training loop on a corridor: learning, records, repeatability and resuming."""
 
 import dataclasses
 import shutil
@@ -41,7 +41,7 @@ def test_corridor_is_solved_without_logs(tmp_path: Path) -> None:
     live = run_to_end(tmp_path / "a", config(schedule={"env_steps": 6000}), logs=None)
     assert live.best is not None
     assert live.best.success == {"nominal": 1.0, "wheel_slip": 1.0}
-    # Forward is the best action of every cell, and the value of the last cell before the goal 1.
+    # Forward is the best action in every cell.
     cells = np.zeros((CELLS - 1, TASK.observation_size), np.float32)
     cells[np.arange(CELLS - 1), np.arange(CELLS - 1)] = 1
     assert live.learner.greedy(cells).tolist() == [1] * (CELLS - 1)
@@ -50,7 +50,7 @@ def test_corridor_is_solved_without_logs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("with_logs", [True, False])
 def test_spent_budget_still_makes_one_interval_of_updates(tmp_path, with_logs):
-    """There is a policy to keep and something to report, however slow the machine."""
+    """Make at least one interval of updates, so that slow machines keep a policy too."""
     settings = config(schedule={"seconds": 1e-9, "offline_updates": 1000, "env_steps": 6000})
     live = run_to_end(tmp_path / "a", settings, **({} if with_logs else {"logs": None}))
     least = settings.record.every_updates
@@ -62,8 +62,8 @@ def test_spent_budget_still_makes_one_interval_of_updates(tmp_path, with_logs):
 
 
 def test_half_of_seconds_budget_is_online(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a robot of few logs and a slow twin ends with a policy that never drove in it."""
-    seconds = count(step=0.01)  # by a clock that each look moves on
+    """Split the time, so that the policy drives even with few logs and a slow twin."""
+    seconds = count(step=0.01)  # a clock that advances on each call
     monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
     settings = config(schedule={"seconds": 3.0, "offline_updates": 10**6, "env_steps": 10**6})
     live = session(tmp_path / "a", settings)
@@ -73,12 +73,12 @@ def test_half_of_seconds_budget_is_online(tmp_path: Path, monkeypatch: pytest.Mo
     assert live.progress.driving_from_s == pytest.approx(1.5, abs=0.1)
     assert live.progress.env_steps > 0
     assert live.learner.gradient_steps < 10**6
-    # The evaluation after it is in the budget too.
+    # The budget includes the final evaluation.
     assert live.progress.planned_env_steps < 10**6
 
 
 class ImmediateExecutor(Executor):
-    """An executor that runs what it is given, in the thread that gives it."""
+    """Executor that runs work at once, in the calling thread."""
 
     def submit(self, work: Any, /, *args: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -185,7 +185,7 @@ def test_evaluation_is_repeatable(tmp_path: Path) -> None:
 
     steps, first = measured()
     assert measured() == (steps, first)
-    # Of the steps that environments drive on, once their episodes are done, none is counted.
+    # Steps that environments make after their episodes have ended are not counted.
     assert sum(row["rows_met"] for row in first) == steps
     live.close()
 
@@ -205,7 +205,7 @@ def test_audit_rows_match_drawn_rows(undisturbed: Session) -> None:
             assert row["behaviour_policy"] in ("planner", "operator")
             stamp = shelf.stamp_ns[row["transition_id"] - 1000] / 86_400e9
             assert row["age_days"] == pytest.approx(10 - stamp)
-            assert row["age_gradient_steps"] == row["gradient_step"]  # since it could be drawn
+            assert row["age_gradient_steps"] == row["gradient_step"]  # drawable from the start
         else:
             assert row["behaviour_policy"] == "dqn"
             assert row["age_env_steps"] >= 0
@@ -226,7 +226,7 @@ def test_finished_episodes_are_labelled_in_the_ring(undisturbed: Session) -> Non
     slip_rows = ring.rows[: len(ring)][
         ring.condition(np.arange(len(ring))) == names.index("wheel_slip")
     ]
-    # Only a forward command can slip, and a slipping robot is where it was.
+    # Only forward commands can slip.
     assert len(slip_rows)
     assert set(slip_rows[:, -3].tolist()) == {1.0}
 
@@ -244,7 +244,7 @@ def test_run_records_target_rule_and_lag(undisturbed: Session, tmp_path: Path) -
     hard = run_to_end(tmp_path / "hard", config(target={"rule": "hard", "every": 25}))
     rows = pq.read_table(hard.run.path / "progress.parquet").to_pylist()
     full = [row for row in rows if row["updates"] == 50]
-    # Every interval ends on a sync, where the distance is 0: what is logged is from just before.
+    # Each interval ends on a sync, where the distance is 0, so it is logged just before.
     assert {row["target_sampled"] for row in full} == {"before_sync"}
     assert all(row["target_param_distance"] > 0 and row["target_q_lag"] > 0 for row in full)
     assert {row["steps_since_sync"] for row in full} == {0}
@@ -333,7 +333,7 @@ def test_kept_policy_averages_weights(monkeypatch):
 
 
 def test_conservative_loss_lowers_unlogged_actions(tmp_path: Path) -> None:
-    """Offline on rows that only drive forward: without it, "back" is worth what chance says."""
+    """Train offline on rows that only drive forward, so other actions have arbitrary values."""
     shelf = logs(400)
     forward = np.flatnonzero(shelf.rows[:, -3].numpy() == 1)
     alone = {"strata": ["nominal"], "timings": ["pre"], "stratum_rows": [forward]}
@@ -359,7 +359,7 @@ def test_conservative_loss_lowers_unlogged_actions(tmp_path: Path) -> None:
 
 def test_margin_drivers_are_listed_once(tmp_path: Path) -> None:
     shelf = logs()
-    nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile
+    nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # as in a profile
     shelf = dataclasses.replace(shelf, behaviour_policy=nobody)
     margin = config(loss={"margin": 1.0})
     with pytest.raises(ConfigError, match=r"choose from what they have: unknown$"):
@@ -374,7 +374,7 @@ def test_invalid_condition_is_rejected_before_training(tmp_path: Path) -> None:
 
 def test_terminating_bump_is_counted(tmp_path: Path) -> None:
     class Backwards:
-        """Into the wall behind the first cell."""
+        """Policy that drives into the wall behind the first cell."""
 
         name = version = ""
 

@@ -1,4 +1,4 @@
-"""The loss against hand arithmetic."""
+"""Check the loss against hand calculations."""
 
 import pytest
 import torch

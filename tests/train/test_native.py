@@ -1,4 +1,4 @@
-"""The compiled update agrees with autograd in double precision, with and without AVX-512."""
+"""Compare the compiled update with autograd in double precision, with and without AVX-512."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def normal(*shape: int, seed: int) -> Tensor:
 def network(hidden: tuple[int, ...], layer_norm: bool) -> QNetwork:
     generator = torch.Generator().manual_seed(0)
     made = QNetwork(OBSERVATION, ACTIONS, hidden=hidden, layer_norm=layer_norm, generator=generator)
-    for index, parameter in enumerate(made.parameters()):  # LayerNorm begins at 1 and 0: not here
+    for index, parameter in enumerate(made.parameters()):  # LayerNorm starts at 1 and 0
         with torch.no_grad():
             parameter.add_(normal(*parameter.shape, seed=50 + index), alpha=0.1)
     return made
@@ -43,14 +43,14 @@ def make_kernel(held: QNetwork, *, wide: bool = True) -> Kernel:
 @pytest.mark.parametrize("layer_norm", [False, True])
 @pytest.mark.parametrize("batch", [1, 37])
 def test_values_and_gradients_match_autograd(hidden, layer_norm, batch):
-    """Of the same network in double precision; and the same bits, how wide vectors ever are."""
+    """Compare with double precision, and bit for bit between vector widths."""
     held = network(hidden, layer_norm)
     exact = clone(held).double().requires_grad_()
     narrow = clone(held)
     both = [(held, make_kernel(held)), (narrow, make_kernel(narrow, wide=False))]
-    packed = normal(batch, 2 * OBSERVATION + 3, seed=1)  # observations are slices of wider rows
+    packed = normal(batch, 2 * OBSERVATION + 3, seed=1)  # strided: slices of wider rows
     now, after = packed[:, :OBSERVATION], packed[:, OBSERVATION : 2 * OBSERVATION]
-    for seed in (2, 3):  # twice: nothing of the first pass is left in the second
+    for seed in (2, 3):  # twice, to check that no state is left
         gradient = normal(batch, ACTIONS, seed=seed)
         expected = exact(now.double())
         exact.zero_grad()
@@ -91,9 +91,9 @@ def floats(*shape: int) -> np.ndarray:
 
 @compiled
 def test_arrays_of_wrong_shape_or_dtype_are_rejected() -> None:
-    """Sizes, types, strides: an error, never a read or a write beside the array."""
+    """Check sizes, types and strides: none may cause reads or writes outside the arrays."""
     module = native.compiled
-    size = 7 * 16 + 16 + 4 * 16 + 16  # of (7, 16, 4), without LayerNorm
+    size = 7 * 16 + 16 + 4 * 16 + 16  # parameters of (7, 16, 4) without LayerNorm
     fixed = floats(size)
     fixed.flags.writeable = False
     good: tuple[Any, ...] = ((7, 16, 4), -1.0, floats(size), floats(size))
@@ -173,7 +173,6 @@ main(["--version"])
 
 @compiled
 def test_gradients_of_two_forward_passes_add_up() -> None:
-    """As autograd does: gradients of two passes are added, in any order."""
     held = network((16, 16), layer_norm=True)
     theirs = clone(held).requires_grad_()
     ours = make_kernel(held)
@@ -197,7 +196,7 @@ def test_native_update_is_bit_identical_to_autograd(source, double, monkeypatch)
         labelled = behaviour.Labelled(rows[:, 3:10], labels)
         given = {"weight": weight, "logged": 9, "labelled": labelled}
         loss = ours.update(rows, **given)
-        monkeypatch.setattr(behaviour, "Kernel", Learner)  # what the behaviour network's is not
+        monkeypatch.setattr(behaviour, "Kernel", Learner)  # not its class
         expected = theirs.update(rows, **given)
         monkeypatch.undo()
         assert all(map(torch.equal, [loss.value, *ours.moved], [expected.value, *theirs.moved]))

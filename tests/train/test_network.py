@@ -1,4 +1,4 @@
-"""The Q network: what LayerNorm does to its features, and what a clone is without."""
+"""Check LayerNorm in the Q network, and clones without gradients."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A run that meets numbers that are not finite stops, names the rows, and leaves what was whole."""
+"""Check that non-finite numbers stop a run, name the rows and leave its files intact."""
 
 import dataclasses
 import json
@@ -44,7 +44,7 @@ def test_changed_panel_byte_is_rejected_before_training(panel, tmp_path, shell):
     whole = rows.read_bytes()
     rows.chmod(0o644)
     try:
-        at = 6003  # the exponent of a number between two of the blocks that every opening looks at
+        at = 6003  # in an exponent, between two blocks that are checked on every open
         rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
         for argv in (["--dry-run"], []):
             error = shell.err("train", "--panel", panel, "--out", out, *TINY, *argv)
@@ -58,7 +58,7 @@ def test_changed_panel_byte_is_rejected_before_training(panel, tmp_path, shell):
     recorded = json.loads((out / "config.json").read_text())["panel"]["blake3"]
     assert recorded == {name: file["blake3"] for name, file in header["files"].items()}
 
-    # Going on reads them again, so they are checked again.
+    # Resuming reads the rows, so it checks them again.
     rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
     try:
         assert "its checksum is" in shell.err("train", "--resume", out, "--env-steps", "120")
@@ -78,7 +78,7 @@ def test_nonfinite_loss_exits_with_code_2(panel, tmp_path, shell):
     assert len(stopped["rows"]) == len(stopped["rows_before"]) == 32
     Run.open(out)  # every table is there
     assert main(["sql", str(out), "FROM progress"]) == 0
-    assert not (out / "checkpoints").exists()  # nothing of it was kept
+    assert not (out / "checkpoints").exists()  # no checkpoint was written
 
 
 def test_nonfinite_logged_row_is_named(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_nonfinite_network_is_not_saved(tmp_path: Path) -> None:
         assert all(torch.isfinite(value).all() for value in network.values())
     losses = pq.read_table(live.run.path / "progress.parquet")["loss"].drop_null().to_numpy()
     assert np.isfinite(losses).all()
-    # What was whole goes on: as if it had never stopped.
+    # The run resumes from its last finite state, like an uninterrupted one.
     again = session(tmp_path / "run", settings, resume=True)
     train(again)
     again.close()

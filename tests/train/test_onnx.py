@@ -1,4 +1,4 @@
-"""Policies as ONNX: the values of PyTorch, usable without it, refused where they do not fit."""
+"""Export policies as ONNX, drive them, and reject files of another task."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_onnx_values_and_actions_match_torch(settings: dict[str, Any]) -> None:
     session = runtime.InferenceSession(to_onnx(policy).SerializeToString())
     rng, known = np.random.default_rng(0), TASK.observation_names.index("nav_known")
     observation = rng.normal(size=(512, TASK.observation_size)).astype(np.float32)
-    observation[:, known] = rng.random(512) < 0.7  # whether navigation proposes anything
+    observation[:, known] = rng.random(512) < 0.7  # 1 if navigation proposes a command
     observation[observation[:, known] == 0, known:] = 0
     values, action = session.run(["values", "action"], {"observation": observation})
     with torch.no_grad():
@@ -106,7 +106,7 @@ def test_invalid_onnx_policy_is_rejected(run: Path, tmp_path: Path, shell: Shell
     out = tmp_path / "p.onnx"
     argv = ["export", str(run), "--to", "onnx", "--out", str(out)]
     assert main(argv) == 0
-    assert "already exists" in shell.err(*argv)  # there already
+    assert "already exists" in shell.err(*argv)  # the file exists
     (tmp_path / "text.onnx").write_text("hello")
     other = DQN(LossConfig()).make_network(NetworkConfig(hidden=(4,)), 3, 2)
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())

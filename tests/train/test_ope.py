@@ -1,4 +1,4 @@
-"""Off-policy evaluation of runs: on episodes they did not learn from, or refused."""
+"""Evaluate runs off-policy on held-out episodes, and check when evaluation is refused."""
 
 import json
 from dataclasses import replace
@@ -83,7 +83,7 @@ def test_success_is_arrival_before_contact(tmp_path: Path) -> None:
     expected, ends = [], []
     for name in dict.fromkeys(row[0] for row in rows):
         episode = [row for row in rows if row[0] == name]
-        # The contact of a step is what the bumper says at the next one, or what ended the episode.
+        # A step has a contact if the bumper reports it in the next row or it ended the episode.
         bumps = [any_after[2] for any_after in episode[1:]]
         bumps.append(episode[-1][3] and episode[-1][4] < TASK.rewards.goal / 2)
         until = bumps.index(True) if True in bumps else len(episode) - 1
@@ -102,7 +102,7 @@ def test_success_is_arrival_before_contact(tmp_path: Path) -> None:
 
 
 def test_contact_before_held_out_part_is_ignored(tmp_path: Path) -> None:
-    """A contact before it left none of its rows, and the evaluation ended in an IndexError."""
+    """Regression: a contact before the held-out part removed all its rows (IndexError)."""
     with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as opened:
         found = opened.sql(
             "SELECT transition_id FROM transitions"
@@ -151,7 +151,7 @@ def test_eval_on_logs_reports_values_and_refusals(
 ):
     run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
-    assert main([*argv, "--dry-run"]) == 0  # fits nothing: it is asked what would be done
+    assert main([*argv, "--dry-run"]) == 0  # a dry run fits nothing
     assert not (run / "eval").exists()
     requested = json.loads(capsys.readouterr().out)
     assert (requested["episodes"], requested["measures"]) == (9, ["return", "success"])

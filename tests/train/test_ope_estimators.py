@@ -1,4 +1,4 @@
-"""Off-policy evaluation against a finite MDP whose value is known: solved as a linear system."""
+"""Check off-policy estimators on a finite MDP whose value is the solution of a linear system."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ STATES, ACTIONS, STEPS, DISCOUNT = 5, 2, 30, 0.9
 
 
 class Chain:
-    """States 0 to 4, the last absorbing: action 1 goes on with chance .8, a step costs .1."""
+    """MDP of 5 states, the last absorbing: action 1 advances with chance .8, a step costs .1."""
 
     def __init__(self) -> None:
         self.move = np.zeros((STATES, ACTIONS, STATES))  # P(s' | s, a)
@@ -39,7 +39,7 @@ class Chain:
         self.move[STATES - 1, :, STATES - 1] = 1.0
 
     def q(self, policy: np.ndarray) -> np.ndarray:
-        """Return Q of a policy (S, A), exact by (I - gamma P) Q = R but for 0.9^30 of it."""
+        """Return Q (S, A) of a policy from (I - gamma P) Q = R, exact up to 0.9^30."""
         reward = (self.move * self.reward).sum(axis=2).reshape(-1)
         onward = np.einsum("sat,tb->satb", self.move, policy).reshape(STATES * ACTIONS, -1)
         solved = np.linalg.solve(np.eye(STATES * ACTIONS) - DISCOUNT * onward, reward)
@@ -48,7 +48,7 @@ class Chain:
     def drive(
         self, policy: np.ndarray, episodes: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, ...]:
-        """States (n, T), actions, rewards, next states and whether there was still a step."""
+        """Return states (n, T), actions, rewards, next states and whether the episode goes on."""
         state = np.zeros(episodes, np.int64)
         found: list[tuple[np.ndarray, ...]] = []
         for _ in range(STEPS):
@@ -79,14 +79,13 @@ NO_MODEL = np.zeros((STATES, ACTIONS))
 
 
 def repeated(episodes: int) -> np.ndarray:
-    """Return importance sampling over 300 data sets."""
+    """Return importance-sampling estimates of 300 data sets."""
     return np.array(
         [per_decision(logged(episodes, seed, NO_MODEL), once(episodes))[0] for seed in range(300)]
     )
 
 
 def test_weighted_estimate_is_consistent() -> None:
-    """More episodes, less error; and little of it with many."""
     few, many = (np.sqrt(np.mean((repeated(n) - TRUTH) ** 2)) for n in (10, 250))
     assert many < few / 2
     found = per_decision(logged(20_000, 1, NO_MODEL), once(20_000))[0]
@@ -97,7 +96,10 @@ def test_fqe_has_the_bias_of_its_model() -> None:
     wrong = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, CHAIN.q(TARGET) + 0.5)
     answers = {e.estimator: e for e in _estimates(logged(4000, 2, wrong))}
     assert answers["fqe"].value == pytest.approx(TRUTH + 0.5, abs=1e-6)
-    assert (answers["fqe"].low, answers["fqe"].high) == (None, None)  # it would leave that .5 out
+    assert (answers["fqe"].low, answers["fqe"].high) == (
+        None,
+        None,
+    )  # it would miss the bias
 
 
 def test_intervals_have_nominal_coverage() -> None:
@@ -131,7 +133,7 @@ def test_gate_refuses_policy_far_from_logs() -> None:
 
 
 def test_too_few_episodes_give_their_own_reason() -> None:
-    """A single episode is worth one, whatever the policy: that says nothing of agreement."""
+    """Refuse one episode for its number: its effective sample size is 1 for any policy."""
     alone = logged(1, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
     answers = {e.estimator: e.refused for e in _estimates(alone)}
     assert answers["pdwis"] == "1 episode, and weights need at least 5"
@@ -143,7 +145,7 @@ TABULAR = replace(TABULAR, learning_rate=0.03)
 
 
 def rows(episodes: int, seed: int) -> tuple[Transitions, np.ndarray]:
-    """Transitions with one-hot observations, and their next states."""
+    """Return transitions with one-hot observations, and their next states."""
     state, action, reward, following, alive = CHAIN.drive(
         BEHAVIOUR, episodes, np.random.default_rng(seed)
     )
@@ -169,7 +171,7 @@ def test_fitted_q_matches_exact_values() -> None:
 
 
 def test_fitted_value_is_mean_of_rare_large_rewards() -> None:
-    """One step in ten costs 10, the others pay 1: Huber's loss said that it pays .9 on average."""
+    """Regression: with one step in ten of -10 and others of 1, the Huber loss gave .9, not -.1."""
     rows, reward = 1000, np.ones(1000, np.float32)
     reward[::10] = -10.0
     seen = Transitions(

@@ -1,4 +1,4 @@
-"""An algorithm of your own, written against the seam alone, learns in a run."""
+"""Train with a custom algorithm in one file."""
 
 from pathlib import Path
 

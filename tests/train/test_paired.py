@@ -1,4 +1,4 @@
-"""A policy against another on the same episodes: paired, by those that both drove."""
+"""Compare two policies in pairs, on the episodes that both drove."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ def evaluated_run(
     shuffle: int = 0,
     friction: float = 0.5,
 ) -> Path:
-    """Return a run with an evaluation of which that share of each condition succeeded."""
+    """Write a run whose evaluation has these success rates per condition."""
     run = Run.create(path, {"config": {}, "panel": None, "task_hash": "t"})
     rows = [
         {
@@ -68,7 +68,7 @@ def verdicts(rows: list[dict[str, object]], perturbation: str = "none") -> dict[
 
 
 def compared(first: Path, second: Path) -> list[dict[str, Any]]:
-    """Compare the runs' own policies on the episodes of both."""
+    """Compare the policies of two runs on their common episodes."""
     driven = [agent_episodes(Run.open(path)) for path in (first, second)]
     tables = [table for table in driven if table is not None]
     return paired(*map(by_cell, tables))
@@ -92,14 +92,14 @@ def test_paired_verdicts_per_condition(baseline: Path, tmp_path: Path) -> None:
 
 
 def test_pairing_detects_small_drop(tmp_path: Path) -> None:
-    """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
+    """Detect 6 of 60 episodes that became failures, which unpaired shares do not show."""
     first = evaluated_run(tmp_path / "a", GOOD)
     second = evaluated_run(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
     assert verdicts(compared(first, second))["wheel_slip"] == "worse"
 
 
 def test_few_episodes_are_inconclusive(tmp_path: Path) -> None:
-    """One episode that fell is no regression: values, without interval and verdict."""
+    """Report values without interval or verdict for few episodes."""
     good = evaluated_run(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
     bad = evaluated_run(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
     rows = compared(good, bad)

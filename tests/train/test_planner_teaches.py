@@ -1,4 +1,4 @@
-"""Navigation's proposal as the teacher: when Q deviates from it, what is kept, what is refused."""
+"""Check the planner teacher: deviation from navigation's proposals, means of runs, rejections."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ KNOWN = TASK.observation_names.index("nav_known")
 
 
 def observations_of(command: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Observations (N, D) with these proposed commands (N, 2), in m/s and rad/s."""
+    """Return observations (N, D) with these proposed commands (N, 2), in m/s and rad/s."""
     rng = np.random.default_rng(0)
     observation = rng.normal(size=(len(command), TASK.observation_size)).astype(np.float32)
     scaled = command / np.abs(np.asarray(TASK.actions)).max(axis=0)
@@ -60,7 +60,7 @@ def learner(margin: float, *, path: str | None = None) -> Learner:
 
 
 def set_q(one: Learner, q: list[float]) -> None:
-    """Let Q be `q` (A,) in every state."""
+    """Make Q equal to `q` (A,) in every state."""
     for network in (one.network, one.target_network, one.policy_network):
         with torch.no_grad():
             network.advantage.weight.zero_()
@@ -69,7 +69,7 @@ def set_q(one: Learner, q: list[float]) -> None:
 
 def test_policy_deviates_only_beyond_the_margin() -> None:
     one = learner(0.3)
-    command = np.asarray(TASK.actions)  # each action is proposed once
+    command = np.asarray(TASK.actions)  # every action is proposed once
     observation = observations_of(command, np.ones(len(command), np.bool_))
     set_q(one, [0.0, 0.25, *[0.0] * (len(command) - 2)])
     assert one.greedy(observation).tolist() == list(range(len(command)))
@@ -77,7 +77,7 @@ def test_policy_deviates_only_beyond_the_margin() -> None:
     assert one.greedy(observation).tolist() == [1] * len(command)
     set_q(one, [0.0, 0.05, *[0.0] * (len(command) - 2)])
     unknown = observations_of(command, np.zeros(len(command), np.bool_))
-    assert one.greedy(unknown).tolist() == [1] * len(command)  # nothing is proposed: Q alone
+    assert one.greedy(unknown).tolist() == [1] * len(command)  # without a proposal, Q decides
 
 
 @pytest.mark.parametrize("path", ["native", "autograd"])
@@ -88,7 +88,7 @@ def test_td_target_uses_action_of_filtered_policy(path: str) -> None:
     scalars = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]], np.float32)
     rows = torch.from_numpy(np.concatenate([after, after, scalars], axis=1))
     td, _, _ = one.td_error(rows)
-    # Of 0, proposed, and 1, better by .2 alone, it is 0; action 2 is .7 worse than 1.
+    # Row 0 keeps the proposed action 0 (1 is better by only .2); row 1 deviates from 2 to 1 (.7).
     assert td.tolist() == pytest.approx([1.0 - 0.5 * 1.0, 1.0 - 0.5 * 1.2])
 
 
@@ -129,7 +129,7 @@ def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None
     words = ["export", str(tmp_path / "runs"), "--to", "run", "--out", str(tmp_path / "mean")]
     assert "mean of runs of 200 steps together" in shell.out(*words)
     run = Run.open(tmp_path / "mean")
-    assert run.document["created_ns"] > 1  # it is newer than what it is the mean of
+    assert run.document["created_ns"] > 1  # newer than the averaged runs
     made = load_agent(run)
     observation = torch.from_numpy(observations_of(np.asarray(TASK.actions), np.arange(10) > 4))
     with torch.no_grad():
@@ -137,7 +137,7 @@ def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None
         torch.testing.assert_close(made.network.values(observation), mean)
         margin = (made.network(observation) - mean).amax(dim=1)
     torch.testing.assert_close(margin, torch.where(torch.arange(10) > 4, 0.3 / 2**0.5, 0.0))
-    assert main(words) == 2  # it exists
+    assert main(words) == 2  # the folder exists
 
 
 def test_mean_of_means_averages_logits(tmp_path: Path) -> None:

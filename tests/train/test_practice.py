@@ -1,4 +1,4 @@
-"""Practice by arm: the rule's shares, what moves them, their record, and what is refused."""
+"""Check practice by mission arm: shares of each rule, updates, records and rejections."""
 
 import math
 from pathlib import Path
@@ -52,7 +52,7 @@ def clocks_at(env_steps: int) -> dict[str, int]:
 def test_shares_sum_to_one_and_keep_their_floor(data: st.DataObject) -> None:
     weights = np.array(data.draw(st.lists(st.floats(0, 1), min_size=1, max_size=12)))
     weights += 0 if weights.sum() > 1e-6 else 1
-    floor = data.draw(st.floats(0, 1)) / len(weights)  # which leaves room for all
+    floor = data.draw(st.floats(0, 1)) / len(weights)  # so that the floors of all arms fit
     shares = with_floor(weights, floor)
     assert math.isclose(shares.sum(), 1.0)
     assert (shares >= floor - 1e-9).all()
@@ -71,9 +71,9 @@ def test_natural_and_even_rules_give_fixed_shares() -> None:
 def test_success_rule_favours_failing_arms(monkeypatch):
     monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
     found = practice(rule="success")
-    np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
+    np.testing.assert_allclose(found.shares, 0.25)  # without results, all arms count as failing
     found.note(ended_episodes("nominal", True, 50) + ended_episodes("wheel_slip", False, 50))
-    found.note(ended_episodes("blocked_aisle", True, 3, "partial"))  # too few to be believed
+    found.note(ended_episodes("blocked_aisle", True, 3, "partial"))  # too few to count
     rows = found.advance(clocks_at(1000))
     np.testing.assert_allclose(found.shares.sum(), 1.0)
     nominal, slip, partial, full = found.shares
@@ -82,7 +82,7 @@ def test_success_rule_favours_failing_arms(monkeypatch):
     assert [row["success_rate"] is None for row in rows] == [False, False, True, True]
     assert [row["episodes"] for row in rows] == [50, 50, 3, 0]
     assert sum(row["given_share"] for row in rows) == pytest.approx(1.0)
-    assert rows[0]["wanted_share"] == 0.25  # what was in force, not what comes
+    assert rows[0]["wanted_share"] == 0.25  # the share of the past interval
 
 
 def test_arm_with_few_missions_uses_rate_of_its_kind() -> None:
@@ -91,7 +91,7 @@ def test_arm_with_few_missions_uses_rate_of_its_kind() -> None:
     found.note(ended_episodes("blocked_aisle", False, 1, "full"))
     rates = found.failure_rate
     assert rates[2] == pytest.approx(0.5 / 7, abs=0.01)  # its own six successes
-    assert rates[3] == pytest.approx(1.5 / 8, abs=0.02)  # the kind's: one of seven
+    assert rates[3] == pytest.approx(1.5 / 8, abs=0.02)  # the kind's rate: one of seven
     assert rates[0] == rates[1] == 1.0  # never driven
 
 
@@ -110,7 +110,7 @@ def test_shares_move_at_interval_ends_within_the_limit() -> None:
     assert found.advance(clocks_at(999)) == []
     found.advance(clocks_at(1000))
     found.advance(clocks_at(2500))
-    assert len(reported) == 3  # at first, and twice after
+    assert len(reported) == 3  # the initial shares and two updates
     steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
     assert steps[0] == pytest.approx(MAX_CHANGE)
     assert steps[1] <= MAX_CHANGE + 1e-9
@@ -153,7 +153,7 @@ def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     first = [twin.queue.next(0)[0] for _ in range(5)]
     assert {spec.condition for spec in first} == {"wheel_slip"}
     twin.queue.drawn[:] = 1
-    assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same, whenever it is asked
+    assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same on every call
 
 
 def test_mission_order_is_a_named_arm() -> None:

@@ -1,4 +1,4 @@
-"""The replay audit record: of a run, in one line of Python, and the same in SQL."""
+"""Read the replay audit record of a run in Python and in SQL."""
 
 import json
 from pathlib import Path
@@ -67,12 +67,12 @@ def test_record_dates_rows_against_last_sync(tmp_path, shell):
     query = f"SELECT source, {before} AS before, count(*) AS n FROM replay_audit GROUP BY ALL"
     found = shell.json("sql", path, query)
     assert {(row["source"], row["before"]) for row in found} == {
-        *(("logs", before) for before in (True, False)),  # until the first sync there was none
+        *(("logs", before) for before in (True, False)),  # before the first sync, no row is older
         *(("fresh", before) for before in (True, False)),
     }
     for row in pq.read_table(path / "audit.parquet").to_pylist():
         assert row["last_target_sync"] == (row["gradient_step"] - 1) // 30 * 30
-        if row["source"] == "fresh":  # the policy that acted is named by its updates
+        if row["source"] == "fresh":  # the version of the acting policy is its update count
             acted = row["gradient_step"] - row["age_gradient_steps"]
             assert int(row["behaviour_version"]) == acted
     records = replay_audit(path)

@@ -1,4 +1,4 @@
-"""A run that was cut goes on bit for bit, whatever its checkpoint holds."""
+"""Check that interrupted runs resume bit for bit, with every kind of saved state."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -26,7 +26,7 @@ from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import checkpoint
 from restock.train.session import Session
 
-# So few logged rows that fresh ones fill the quotas too.
+# Few logged rows, so that fresh rows fill the quotas too.
 QUOTAS = "max_replays_per_row = 8\n" + "".join(
     f"[[strata]]\nname = '{name}'\nunit = 'episode'\nshare = 0.5\n"
     for name in ("nominal", "wheel_slip")
@@ -35,7 +35,7 @@ SHORT = {"env_steps": 480}
 
 
 class RandomTeacher:
-    """A teacher that draws, so that its state matters."""
+    """Teacher that draws random actions, so that its state matters."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(1)
@@ -61,7 +61,7 @@ def logs_of_mixture(text: str, conditions: Iterable[Condition]) -> Callable[[Pat
 
 
 CASES: dict[str, tuple[dict[str, Any], Callable[[Path], Logs] | None, Callable[[], Any]]] = {
-    # Each batch is audited, so rows wait for the labels of episodes under way.
+    # Every batch is audited, so rows wait for labels of running episodes.
     "network, ring, twin, tables": ({"record": {"audit_share": 1.0}}, None, lambda: None),
     "every term of the loss": (
         {"loss": {"margin": 0.5, "conservative": 0.1}, "target": {"rule": "hard", "every": 13}},
@@ -108,7 +108,7 @@ def test_interrupted_run_matches_uninterrupted_run(case, tmp_path, monkeypatch):
     whole = opened("whole")
     train(whole)
     whole.close()
-    # Once on the logs, once while it learns in the twin.
+    # Interrupt once offline and once online.
     cut = opened("cut")
     train_until(cut, lambda: cut.learner.gradient_steps >= 20)
     again = opened("cut", resume=True)
@@ -119,7 +119,7 @@ def test_interrupted_run_matches_uninterrupted_run(case, tmp_path, monkeypatch):
     assert_same_run(whole, last)
     if case == "practice":
         rows = whole.run.table("practice").to_pylist()
-        assert len({row["wanted_share"] for row in rows}) > 2  # they did move
+        assert len({row["wanted_share"] for row in rows}) > 2  # the shares did change
         assert sum(row["episodes"] for row in rows) == whole.run.table("episodes").num_rows
 
 
@@ -142,7 +142,7 @@ def resume_and_train(path: Path, settings: TrainConfig) -> Session:
 
 @pytest.mark.parametrize("evaluation", one_in(2, [1, 2, 3]))
 def test_resume_repeats_abandoned_evaluation(undisturbed, settings, tmp_path, evaluation):
-    """After the logs, among online updates, and at the end."""
+    """Abandon the evaluation after the offline phase, during online updates, or at the end."""
     path = tmp_path / "a"
     live = session(path, settings)
     steps = iter(range(4))

@@ -1,4 +1,4 @@
-"""The run directory: readable at any moment, never half-written, continued where it was."""
+"""Check the run directory: readable at any moment, and protected from damage and reuse."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def test_flipped_bit_in_table_is_reported(tmp_path, read):
     file = run.path / "policies.parquet"
     whole, rows = file.read_bytes(), read(run.path)
     refused = []
-    # DuckDB is not given the names of the columns, which stand in the footer.
+    # DuckDB does not use the column names in the footer.
     end = len(whole) - (8 + int.from_bytes(whole[-8:-4], "little")) * (read is select_policies)
     for place in range(4, end, 13):
         flipped = bytearray(whole)
@@ -62,7 +62,7 @@ def test_existing_run_is_rejected_with_resume_hint(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"already exists\n.*--resume"):
         Run.create(tmp_path / "a", {})
     Run.create(tmp_path / "a b", {})
-    with pytest.raises(RunError, match=r"`restock train --resume '.*a b'`"):  # to be pasted
+    with pytest.raises(RunError, match=r"`restock train --resume '.*a b'`"):  # quoted, to be pasted
         Run.create(tmp_path / "a b", {})
     (tmp_path / "empty").mkdir()
     Run.create(tmp_path / "empty", {})  # an empty directory is free

@@ -1,4 +1,4 @@
-"""What differs between two runs of a folder: settings, panels and evaluation."""
+"""Compare two runs with `restock coverage diff`: settings, panels and evaluation."""
 
 from pathlib import Path
 

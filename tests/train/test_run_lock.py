@@ -1,4 +1,4 @@
-"""A run has one writer, whoever reads it, and a killed writer does not lock it for good."""
+"""Check that a run has one writer, stays readable, and is unlocked if its writer is killed."""
 
 import errno
 import fcntl
@@ -23,13 +23,13 @@ def test_lock_is_free_after_its_holder_is_killed(tmp_path: Path) -> None:
     with holder:
         assert holder.stdout is not None
         holder.stdout.readline()
-        for _ in range(2):  # one that is refused changes nothing
+        for _ in range(2):  # a rejected writer changes nothing
             with pytest.raises(RunError) as refused:
                 RunLock(run)
             assert f"{run}: is being trained by process {holder.pid}\n" in str(refused.value)
             assert f"`kill {holder.pid}`" in str(refused.value)
         holder.kill()
-    assert (run / LOCK).exists()  # left by the killed one
+    assert (run / LOCK).exists()  # left by the killed process
     check_free(run)
     RunLock(run).release()
     assert not (run / LOCK).exists()

@@ -1,4 +1,4 @@
-"""The shares of a run: its own draws, and the cap a row that holds."""
+"""Check the stratum shares of a run and the limit of replays per row."""
 
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,10 @@ def test_shares_respect_replay_cap_of_planned_draws() -> None:
     plan = controller(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.9, 0.1])
     assert plan.logs_share == 0.5
-    # Twice the run: half the share.
+    # A run of twice the length halves the share.
     plan = controller(text, [10_000, 100], PlannedDraws(0, 200_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.95, 0.05])
-    # All rows together bear 20,000 of 60,000: 10,000 go to the offline phase, 10,000 of 50,000 on.
+    # All rows allow 20,000 of 60,000 draws: 10,000 offline and 10,000 of 50,000 online.
     plan = controller(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.75, 0.25])
     assert plan.logs_share == pytest.approx(0.1)
@@ -65,7 +65,7 @@ def test_shares_respect_replay_cap_of_planned_draws() -> None:
 
 
 def test_capped_rows_are_used_up_over_the_run() -> None:
-    """Check that missing draws are not asked for again at each new share."""
+    """Check that a shortfall of draws is not requested again at each new share."""
     plan = controller(
         f"max_replays_per_row=50\n{HALVES}", [100, 100], PlannedDraws(0, 128_000, 0, 1000)
     )
@@ -100,7 +100,7 @@ def test_no_row_exceeds_max_replays(table, tmp_path, within):
     rng = np.random.default_rng(0)
     counted = np.zeros(len(built), np.int64)
     drawn = 0
-    # The run goes on for longer than it said: the rows still bear no more.
+    # Draw more than was planned: the limit still holds.
     while True:
         batch = draws.draw(64)
         np.add.at(counted, batch.rows, 1)
@@ -110,7 +110,7 @@ def test_no_row_exceeds_max_replays(table, tmp_path, within):
         if len(batch.rows) < 64:
             break
         draws.update(batch.rows, rng.random(64))
-    assert drawn == 9 * len(built)  # all of it was given before the end
+    assert drawn == 9 * len(built)  # all allowed draws were made
     np.testing.assert_array_equal(draws.replays, counted)
     rows = draws.describe()
     assert all(row["exhausted"] and row["replays_max"] == 9 for row in rows if row["rows"])
@@ -122,7 +122,7 @@ def test_no_row_exceeds_max_replays(table, tmp_path, within):
 def test_exhausted_stratum_gives_its_share_to_others(table: pa.Table, tmp_path: Path) -> None:
     text = "max_replays_per_row = 20\n[[strata]]\nname = 'near_collision'\nshare = 0.5\n"
     built = panel(table, tmp_path / "p", text + "[each_condition]\n")
-    draws = sampler_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
+    draws = sampler_of(built, PlannedDraws(online=10))  # far fewer draws than are made
     place = [stratum.name for stratum in built.strata].index("near_collision")
     assert draws.controller.shares[place] == 0.5
     limit = 20 * built.strata[place].rows
@@ -136,7 +136,7 @@ def test_exhausted_stratum_gives_its_share_to_others(table: pa.Table, tmp_path: 
 
 
 def test_weights_follow_current_shares(table: pa.Table, tmp_path: Path) -> None:
-    """Full correction keeps P(outcome) what it was, however the shares move."""
+    """Check that full correction preserves P(outcome) under any shares."""
     text = LIMITED.replace("density_ratio", "full")
     built = panel(table, tmp_path / "p", text)
     draws = sampler_of(built, PlannedDraws(0, 1_000, 0, 1200))
@@ -153,7 +153,7 @@ def test_weights_follow_current_shares(table: pa.Table, tmp_path: Path) -> None:
         assert (shares * mean).sum() == pytest.approx(1, rel=1e-4)
         density = shares * mean / rows
         nominal = [stratum.name for stratum in built.strata].index("nominal")
-        # Rows of the nominal state are drawn alike, whatever their outcome was.
+        # Rows of the nominal state have equal probability for all outcomes.
         state = built.meta["state_code"].to_numpy()
         of_nominal = state == nominal
         per_row = (shares / rows)[built.stratum_code] * weight
@@ -171,7 +171,7 @@ SETTINGS = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
 
 @pytest.fixture(scope="module")
 def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Panel]:
-    """Return a run on everything at once."""
+    """Return a finished run whose mixture limits replays, and its panel."""
     path = tmp_path_factory.mktemp("runs")
     built = panel(table, path / "panel", LIMITED)
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
@@ -190,7 +190,7 @@ def test_run_records_current_shares(whole: tuple[Session, Panel]) -> None:
     assert live.batches.controller is not None
     np.testing.assert_allclose([row["share"] for row in last], live.batches.controller.shares)
     assert [row["share"] for row in last] != [row["planned_share"] for row in last]
-    # What was asked for is what was drawn.
+    # The drawn shares match the requested ones.
     strata = pq.read_table(path / "strata.parquet").to_pylist()
     for row in strata:
         if row["source"] == "logs" and row["phase"] == "online":

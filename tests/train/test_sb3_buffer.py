@@ -1,4 +1,4 @@
-"""Stable-Baselines3's buffer alone: its n-step rows, its continuous actions, what it refuses."""
+"""Check the Stable-Baselines3 buffer: n-step rows, continuous actions and rejected input."""
 
 from pathlib import Path
 
@@ -26,7 +26,6 @@ def panel(store: Path) -> Panel:
 
 @pytest.mark.long
 def test_fresh_rows_match_sb3_nstep_buffer(tmp_path: Path) -> None:
-    """Against Stable-Baselines3's own n-step buffer, fed the same steps."""
     from stable_baselines3.common.buffers import NStepReplayBuffer
 
     env = sb3_envs(2)
@@ -90,7 +89,7 @@ def test_sac_trains_on_continuous_actions_with_logs(panel, store, tmp_path, give
     np.testing.assert_allclose(physical, np.clip(driven, space.low, space.high), atol=1e-6)
     audit = run_tables(tmp_path / "run")["audit"]
     assert {row["source"] for row in audit} == {"logs", "fresh"}
-    assert all(row["td"] is None for row in audit)  # SAC keeps it to itself
+    assert all(row["td"] is None for row in audit)  # SAC does not report it
 
 
 def test_unusable_weights_are_rejected(store: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A saved model of Stable-Baselines3 is loaded to act, and to train on in its run or another."""
+"""Load saved Stable-Baselines3 models, to act and to continue training."""
 
 import shutil
 from pathlib import Path
@@ -18,12 +18,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 from restock.train.libraries.sb3_buffer import dqn_critic  # noqa: E402
 
 BATCH = 32
-# Of an observation's bytes its episodes and steps: a seed's episodes come again when it is loaded.
+# Observation bytes -> (episode, step) pairs; a loaded model repeats the episodes of its seed.
 Places = dict[bytes, set[tuple[int, int]]]
 
 
 class RecordingEnv(gymnasium.Wrapper):
-    """Keeps every observation with its episode and step, by its bytes."""
+    """Wrapper that records the episode and step of each observation, keyed by its bytes."""
 
     def __init__(self, place: Places) -> None:
         super().__init__(gymnasium.make("restock/Warehouse-v0"))
@@ -53,7 +53,7 @@ def place() -> Places:
 
 @pytest.fixture
 def saved(tmp_path: Path, place: Places) -> Any:
-    """Return a DQN in the middle of an episode, saved with its buffer."""
+    """Return a DQN that was saved with its buffer in the middle of an episode."""
     panel = make_panel(make_store(tmp_path), tmp_path / "panel", n_step=3)
     fed = {"panel": str(panel.path), "run": str(tmp_path / "run"), "n_step": 3, "log_every": 10}
     model = sb3_model(
@@ -100,7 +100,7 @@ def test_training_without_saved_buffer_is_rejected(saved: Any, tmp_path: Path) -
 
 
 def test_training_continues_in_the_saved_run(saved: Any, tmp_path: Path, place: Places) -> None:
-    saved.learn(60, reset_num_timesteps=False)  # of which the saved buffer knows nothing
+    saved.learn(60, reset_num_timesteps=False)  # after the buffer was saved
     saved.replay_buffer.close()
     model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")
     model.load_replay_buffer(tmp_path / "buffer")
@@ -118,7 +118,7 @@ def test_training_continues_in_the_saved_run(saved: Any, tmp_path: Path, place: 
     )
     seconds = [row["wall_s"] for row in tables["progress"]]
     assert seconds == sorted(seconds)
-    # Two steps were under way as the buffer was saved and two are now.
+    # Two n-step rows were incomplete when the buffer was saved, and two are now.
     assert len(ring) == 144 - 2 - 2
     for row, horizon in zip(ring.rows, ring.meta["horizon"][: len(ring)], strict=False):
         begin = place[row[ring.columns["observation"]].tobytes()]

@@ -1,4 +1,4 @@
-"""Bounds of a mean difference that hold after every pair: errors counted in simulations."""
+"""Check the error rates of sequential bounds of a mean difference in simulations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`restock train`: every arm with every seed, once; what is there is not done again."""
+"""Check studies of `restock train`: runs of each arm and seed, comparisons and rejections."""
 
 import json
 from pathlib import Path
@@ -49,7 +49,7 @@ PRIMARY = "primary = { arm = 'b', measure = 'auc_rare' }"
 
 @pytest.fixture(autouse=True)
 def no_references(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drive neither the planner nor the operator."""
+    """Skip the reference drives of planner and operator."""
     monkeypatch.setattr(study_run, "_drive_references", lambda plan, say: None)
 
 
@@ -58,7 +58,7 @@ def test_study_runs_each_arm_once_and_compares(tmp_path: Path, capsys, shell: Sh
     (tmp_path / "s.toml").write_text(SMALL)
     out = tmp_path / "out"
     argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
-    # So short a run shows too few episodes for the gate: refused, and said so.
+    # The run has too few episodes, so the comparison is refused.
     found = json.loads(shell.out(*argv, code=1))
     (comparison,) = found["comparisons"]
     assert (comparison["arm"], comparison["baseline"]) == ("dueling", "plain")
@@ -70,7 +70,7 @@ def test_study_runs_each_arm_once_and_compares(tmp_path: Path, capsys, shell: Sh
     main(argv)
     assert "2 of 2 runs already exist" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    # The same directory, another question.
+    # Other settings in the same directory are rejected.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
     assert "was trained with other settings" in shell.err(*argv)
 
@@ -97,7 +97,7 @@ def test_dry_run_lists_the_runs(tmp_path: Path, shell: Shell) -> None:
 
 
 def test_arm_may_set_baseline_and_treatment(tmp_path: Path, shell: Shell) -> None:
-    # coverage against uniform as mixtures; the same mixture with a margin, as an algorithm.
+    # Compare coverage with uniform as mixtures, and a margin on one mixture as an algorithm.
     (tmp_path / "s.toml").write_text("""
 treatment = "mixture"
 seeds = [0]
@@ -121,7 +121,7 @@ treatment = "method"
 
 
 def make_finished_runs(tmp_path: Path, text: str) -> Path:
-    """Write s.toml; return its folder of results, in which all was trained and evaluated."""
+    """Write s.toml; return its output folder, in which every run is marked as finished."""
     (tmp_path / "s.toml").write_text(text)
     plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
     for job in plan.jobs:
@@ -216,7 +216,7 @@ def test_no_run_starts_after_a_failure(tmp_path, capsys, monkeypatch, interrupte
             assert running.wait(30)
             raise RunError("ran out of disk", where="here")
         running.set()
-        for _ in range(3000):  # until the failure is said
+        for _ in range(3000):  # until the failure is reported
             if "waiting for those under way" in "".join(messages):
                 break
             sleep(0.01)
@@ -270,7 +270,7 @@ def test_dry_run_checks_mixtures(tmp_path: Path, shell: Shell) -> None:
             f"primary = {{ arm = 'a', measure = 'auc_rare' }}\n{TWO}",
             "primary: 'a' is not one of the arms after the first",
         ),
-        # A policy is the best of its own fixed episodes (seeds 90000 on): others must judge it.
+        # Seeds from 90000 on select the best policy, so others must evaluate it.
         (
             f"{TWO}[settings]\nevaluation.seed = 10_039",
             "evaluated on seeds 10000 to 10039, which include those that choose",

@@ -1,4 +1,4 @@
-"""Target updates, and the two clocks example: online and target estimate over four updates."""
+"""Check target updates, by hand and on the two-clocks example."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from restock.train.dqn.learner import TargetUpdate, value_lag
 
 
 class ScalarEstimate(nn.Module):
-    """An estimate of one number."""
+    """Module with one parameter."""
 
     def __init__(self, value: float) -> None:
         super().__init__()
@@ -17,7 +17,7 @@ class ScalarEstimate(nn.Module):
 
 
 def test_hard_target_of_two_clocks_example() -> None:
-    """One state with a self-loop (reward 1, discount .5) closes on 1 before the sync."""
+    """Update one state with a self-loop (reward 1, discount .5)."""
     online, target = ScalarEstimate(0.0), ScalarEstimate(0.0)
     clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
     history = []

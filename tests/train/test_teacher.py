@@ -1,4 +1,4 @@
-"""A teacher's filter: plausible actions, what Q chooses among them, who is asked, what is kept."""
+"""Check teachers: the filter of plausible actions, the greedy choice, sources and saved state."""
 
 import json
 import sys
@@ -83,7 +83,7 @@ def test_implausible_actions_are_not_chosen_or_bootstrapped() -> None:
 
 
 def forward(env: Any, observation: np.ndarray) -> np.ndarray:
-    """Return a teacher on the corridor: on, but nothing to say of the first cell."""
+    """Answer FORWARD in every cell but the first, where the answer is UNKNOWN."""
     return np.where(observation[:, 0] == 1, UNKNOWN, FORWARD)
 
 
@@ -122,7 +122,7 @@ def test_offline_cloning_filters_actions_before_driving(tmp_path: Path) -> None:
     behaviour = live.learner.behaviour
     assert behaviour is not None
     assert behaviour.updates == 200
-    # Seven of ten logged steps go on: nothing else is half as likely.
+    # Seven of ten logged steps go forward: no other action is half as likely.
     cells = torch.zeros(CELLS - 1, TASK.observation_size)
     cells[range(CELLS - 1), range(CELLS - 1)] = 1
     assert live.learner.greedy(cells.numpy()).tolist() == [FORWARD] * (CELLS - 1)
@@ -235,7 +235,7 @@ class Made:
 @pytest.mark.parametrize(
     ("source", "message", "line"),
     [
-        # Called, made, imported: each raises, and its own line is the place.
+        # Errors in a call, in the constructor and on import; the line is the user's own.
         ("mine:broken", "mine:broken raised ValueError", 5),
         ("mine:ended", "mine:ended raised SystemExit", 8),
         ("mine:Made", "making the teacher mine:Made raised TypeError", 10),
@@ -319,7 +319,7 @@ def test_teacher_table_records_filter_statistics(taught: Any) -> None:
         assert row["teacher_plausible"] >= row["agreement"]
         assert row["ratio"] == 0.5
     fresh = [row for row in last if row["source"] == "fresh"]
-    assert all(row["agreement"] == row["chosen_agreement"] == 1 for row in fresh)  # "on" it said
+    assert all(row["agreement"] == row["chosen_agreement"] == 1 for row in fresh)  # always FORWARD
     near = [row["loss"] for row in rows if row["condition"] == "near_goal"]
     assert near[-1] < near[0]
 

@@ -1,4 +1,4 @@
-"""The curves of a run in W&B and MLflow, read back from their own files; a tracker that fails."""
+"""Check tracking in W&B and MLflow, and failing trackers."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ CURVES = [(100, {"loss": 2.0, "phase": "online"}), (200, {"loss": 0.5, "q_mean":
 
 
 class FailingTracker:
-    """Takes nothing."""
+    """Tracker that fails on every value."""
 
     name = "mlflow"
 
@@ -50,7 +50,7 @@ def make_run(path: Path) -> Run:
 
 
 def log_curves(run: Run, name: str) -> Events:
-    """Return a run's curves, to one tracker."""
+    """Log CURVES of a run to one tracker."""
     events = Events(run.path, tracker_sinks(run, [name]))
     for step, values in CURVES:
         events.scalars(step, "train", values)
@@ -114,7 +114,7 @@ def test_mlflow_has_the_curves_config_and_panel(tmp_path, monkeypatch):
     assert kept.info.status == "FINISHED"
     assert kept.data.params["panel.id"] == PANEL["id"]
     assert kept.data.params["panel.store_version"] == "3"
-    # A run that goes on is the same one there.
+    # A resumed run continues the same MLflow run.
     again = Events(run.path, tracker_sinks(run, ["mlflow"]))
     again.scalars(300, "train", {"loss": 0.25})
     again.close()

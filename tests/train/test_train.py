@@ -1,4 +1,4 @@
-"""`restock train` and `restock eval` in the real twin: small runs, and every refusal."""
+"""Check `restock train` and `restock eval` in the twin with small runs and invalid arguments."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, panel: Path) -> Path:
-    """Return a small run on that panel, 264 days later."""
+    """Return a small run that begins 264 days after the logs of its panel."""
     path = tmp_path_factory.mktemp("runs") / "a"
     argv = ["train", "--panel", str(panel), "--out", str(path), "--env-steps", "400", *TINY]
     with pytest.MonkeyPatch.context() as patch:
@@ -64,21 +64,20 @@ def test_config_json_records_panel_task_and_versions(trained: Path, panel: Path)
     document = json.loads((trained / "config.json").read_text())
     header = json.loads((panel / "panel.json").read_text())
     assert document["panel"]["id"] == header["id"]
-    assert document["panel"]["store"] == header["store"]  # by which `restock compare` knows it
+    assert document["panel"]["store"] == header["store"]  # `restock compare` compares it
     assert document["created_ns"] == BEGAN_NS
     assert document["panel"]["newest_ns"] == header["newest_ns"]
     assert document["task_hash"] == load_profile("warehouse_amr").task.hash
     assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
     assert document["seeds"]["run"] == 0
     assert set(document["versions"]) >= {"restock", "torch", "mujoco", "python"}
-    # What fills the quotas is worked out for this run's own draws: half of a batch is from logs,
-    # and all of it offline.
+    # The forecast is for this run's draws: half logged rows online, all offline.
     forecast, planned = document["panel"]["forecast"], document["panel"]["planned_draws"]
     assert sum(row["wanted_share"] for row in forecast) == pytest.approx(1)
     logged = sum(row["logs_share"] for row in forecast)
     whole = planned["offline"] + planned["online"]
     assert logged == pytest.approx((planned["offline"] + planned["online"] / 2) / whole)
-    assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
+    assert document["config"]["epsilon"]["start"] == 0.2  # lower, after offline training
 
 
 def test_online_batches_are_half_logged_rows(trained: Path) -> None:
@@ -91,7 +90,7 @@ def test_online_batches_are_half_logged_rows(trained: Path) -> None:
 
 
 def test_age_of_logs_counts_from_run_start(trained: Path) -> None:
-    """When the run began, not beside the newest of their store."""
+    """Measure age from the start of the run, not from the newest row of the store."""
     audit = pq.read_table(trained / "audit.parquet").to_pylist()
     assert all(264 < row["age_days"] < 265 for row in audit if row["source"] == "logs")
     days = pq.read_table(trained / "ages.parquet", filters=[("unit", "=", "days")]).to_pylist()
@@ -129,15 +128,15 @@ def test_resume_in_twin_is_bit_exact(tmp_path, panel, shell):
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
     path = tmp_path / "parts"
-    # What a kill while a checkpoint or a table is written leaves behind …
+    # Temporary files that a killed process leaves behind …
     (path / "checkpoints" / f".latest.safetensors.{2**22 + 1}.tmp").write_bytes(b"half")
     (path / f".progress.parquet.{2**22 + 1}.tmp").write_bytes(b"half")
-    # … and what is another's, or still being written.
+    # … and files of other programs or of running processes.
     kept = [path / ".mine.tmp", path / "checkpoints" / ".mine.safetensors.x.tmp"]
     kept.append(path / f".progress.parquet.{os.getppid()}.tmp")
     for file in kept:
         file.write_bytes(b"not of that process")
-    # A run whose budget is raised goes on; only its closing evaluation at 240 is extra.
+    # A raised budget continues the run; only the evaluation at 240 is extra.
     assert "nothing to do: its budget of 240 environment" in shell.err(
         "train", "--resume", tmp_path / "parts", code=0
     )
@@ -207,7 +206,7 @@ def test_killed_run_resumes_bit_exactly(tmp_path: Path, rows: int) -> None:
             time.sleep(0.01)
         process.kill()  # SIGKILL
     for table in path.glob("*.parquet"):
-        pq.read_table(table)  # readable, each of them
+        pq.read_table(table)  # each table is readable
     assert main(["train", "--resume", str(path)]) == 0
     whole, killed = (
         checkpoint.load(tmp_path / name / "checkpoints" / "latest.safetensors")

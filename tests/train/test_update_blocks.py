@@ -1,4 +1,4 @@
-"""Updates in blocks: as one by one on the CPU, and on a GPU as a graph that is replayed."""
+"""Compare updates in blocks with single updates, on the CPU and as a CUDA graph."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from restock.train.loop import train
 from restock.train.session import Session
 
 OFFLINE = {"env_steps": 0, "offline_updates": 3 * LONGEST + 5}
-# What the policy would do in audited rows is asked at the end of a block.
+# Tables with the policy's action in audited rows, computed at the end of a block.
 POLICY_TABLES = {"actions", "audit"}
 
 
@@ -34,7 +34,7 @@ def device(request: pytest.FixtureRequest) -> str:
 def in_blocks(
     path: Path, device: str, *, resume: bool = False, logs: Logs | None = None, **changes: Any
 ) -> Session:
-    """Not trained yet."""
+    """Open a session that updates in blocks."""
     parts = {} if logs is None else {"logs": logs}
     live = session(path, config(device=device, **changes), resume=resume, **parts)
     if live.blocks is None:
@@ -63,7 +63,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_blocks_match_single_updates(variant: str, device: str, tmp_path: Path) -> None:
-    """What is fed, to the bit; what is learnt, but for rounding."""
+    """Compare sampled rows bit for bit, and weights up to rounding."""
     changes = {**VARIANTS[variant], "schedule": OFFLINE}
     one = run_to_end(tmp_path / "one", config(**changes))
     blocks = train_and_close(in_blocks(tmp_path / "blocks", device, **changes))
@@ -83,7 +83,7 @@ def test_blocks_match_single_updates(variant: str, device: str, tmp_path: Path) 
 
 
 def test_online_run_in_blocks_matches_single_updates(tmp_path: Path) -> None:
-    """Online too: the ring, the target's clock, the intervals and what is recorded."""
+    """Compare the ring, the weights and all tables of an online run."""
     short = {"schedule": {"env_steps": 800}}
     one = run_to_end(tmp_path / "one", config(**short))
     blocks = train_and_close(in_blocks(tmp_path / "blocks", "cpu", **short))
@@ -111,7 +111,7 @@ def test_run_in_blocks_is_repeatable_and_resumable(device: str, tmp_path: Path) 
 
 
 def test_priorities_feed_blocks_like_single_updates(device, tmp_path):
-    """A draw follows the TD errors before it."""
+    """Draw by priority, which depends on the TD errors of earlier updates."""
     text = "discount = 0.9\nwithin = 'per'\n[each_condition]\nshare = 'equal'\n"
     table = recording_transitions(1, task=TASK)
     built = panel_of(table, text, tmp_path / "panel", task=TASK, conditions=CONDITIONS)
@@ -133,7 +133,7 @@ def test_device_table_follows_the_ring(device: str) -> None:
     shelf = logs()
     table = DeviceTable(shelf.rows, ring, torch.device(device))
     rng = np.random.default_rng(0)
-    for step in range(40):  # more than once around
+    for step in range(40):  # more than one lap of the ring
         observation = rng.random((4, TASK.observation_size)).astype(np.float32)
         ended = rng.random(4) < 0.1
         ring.append(
