@@ -1,4 +1,4 @@
-"""Every block of the documentation runs as it is printed, in the folder of a reader."""
+"""Run every block of the documentation as printed, in a reader's folder."""
 
 import re
 import shutil
@@ -44,7 +44,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
 
 @pytest.fixture(scope="session")
 def prepared(server: Reader, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return what a reader has: recordings, a store and a panel of them, two runs."""
+    """Return a reader's folder: recordings, their store and panel, and two runs."""
     folder = tmp_path_factory.mktemp("prepared")
     (folder / "sample_logs").symlink_to(ROOT / "sample_logs")
     (folder / "docs").symlink_to(ROOT / "docs")
@@ -100,7 +100,7 @@ def test_blocks_are_fenced_and_name_a_language(page: Path) -> None:
 
 
 def test_unrun_blocks_are_few_and_give_reasons() -> None:
-    """Each needs what no test has. A new one is counted here, so that it is seen in review."""
+    """Limit the blocks that are not run, so that a new one is seen in review."""
     reported = [block for block in chain(*ALL.values()) if block.language in RUN]
     left_out = {b.place: b.marks["not run"] for b in reported if "not run" in b.marks}
     assert all(len(reason.split()) >= 2 for reason in left_out.values()), left_out
@@ -115,7 +115,7 @@ def check_mixture(block: Block, folder: Path) -> None:
 
 
 def check_study(block: Block, folder: Path) -> None:
-    """Check a part of a study; what it leaves out comes from the page's whole one."""
+    """Check a part of a study, with missing keys from the page's whole study."""
     whole = next(b for b in blocks(ROOT / block.page) if b.marks.get("file") == "study.toml")
     own = tomllib.loads(block.text)
     left_out = {
@@ -143,7 +143,7 @@ unit = "rad/s"
 max_age_s = 0.2
 """
     for side in ("left", "right")
-)  # the custom signals that a reader of docs/profile.md has when its condition is added
+)  # custom signals that docs/profile.md adds before its condition
 
 
 def check_profile(block: Block, folder: Path) -> None:
@@ -157,7 +157,7 @@ def check_profile(block: Block, folder: Path) -> None:
     load_profile(folder / "profile.toml")
 
 
-# Blocks of TOML that are no file of a page's commands: how a page's are checked.
+# Page -> check of its TOML blocks that are not files of its commands.
 CHECKS: dict[str, Callable[[Block, Path], None]] = {
     "docs/mixture.md": check_mixture,
     "docs/compare.md": check_study,

@@ -1,4 +1,4 @@
-"""The documentation as a site: its references are filled in, and it opens without a network."""
+"""Build the documentation site and check that it opens without a network."""
 
 import re
 import subprocess
@@ -21,7 +21,7 @@ def test_site_builds_and_loads_nothing_external(tmp_path: Path) -> None:
     site = tmp_path / "site"
     page = (site / "index.html").read_text(encoding="utf-8")
     loaded = re.findall(r'<(?:script|link)\b[^>]* (?:src|href)="([^"]*)"', page)
-    assert "./javascripts/iframe-worker.js" in loaded  # without it there is no search from file://
+    assert "./javascripts/iframe-worker.js" in loaded  # needed for search from file://
     assert [one for one in loaded if not (site / one).is_file()] == []
     assert (site / "search.js").is_file()
     reference = (site / "reference.html").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The tutorial: one source for page and notebook, executed as it is, with nothing cut short."""
+"""Run the tutorial, whose page and notebook have one source."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def check_verdicts(notebook: nbformat.NotebookNode) -> None:
 
     assert "REFUSED" in of("restock compare plain unnormed")
     assert of("fair = compare").startswith("comparable\n")
-    # Another processor's last bits may have a condition of few rows named beside the target.
+    # On other processors, rounding may add a condition of few rows to the cause.
     assert re.search(r"^(TARGET|BOTH)$", of("restock diagnose frozen"), re.MULTILINE)
     assert re.search(r"^BUFFER$", of("restock diagnose dry"), re.MULTILINE)
     figures = re.findall(r"(\w+): L ([\d.]+) .*, supply of slip ([\d.]+) ", of("figures = {"))

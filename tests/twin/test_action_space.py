@@ -1,4 +1,4 @@
-"""Two action spaces of one task: an index into the table, or any command within its reach."""
+"""Check both action spaces: an index into the table, or a continuous command."""
 
 import gymnasium
 import numpy as np
@@ -68,7 +68,7 @@ def test_nan_command_is_rejected() -> None:
 
 @pytest.mark.parametrize("index", [-1, 10, 0.7, np.nan])
 def test_action_index_out_of_range_is_rejected(index: float) -> None:
-    """-1 drove the last action, and .7 the first."""
+    """Regression: -1 selected the last action, and .7 the first."""
     made = WarehouseVectorEnv(2)
     made.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1 of the twin: an action must be an index"):

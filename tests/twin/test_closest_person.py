@@ -1,4 +1,4 @@
-"""How near the robot comes to people and forklifts: true, and measured where it is asked for."""
+"""Check the distance from the robot to the closest person or forklift."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ angles = st.floats(-3.1, 3.1)
 
 
 def outline(x: float, y: float, yaw: float, half: tuple[float, float]) -> np.ndarray:
-    """Return points all along a rectangle's edge."""
+    """Return points along the edge of a rectangle."""
     along = np.linspace(-1, 1, 201)
     edge = np.full_like(along, 1.0)
     local = np.concatenate(
@@ -51,7 +51,7 @@ def test_distance_matches_outlines(x, y, yaw, px, py, heading, truck):
         true = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1)).min()
     else:
         true = np.hypot(*(mine - (px, py)).T).min() - PERSON_RADIUS_M
-    if true > 0.4:  # else one may stand in the other, which has no distance of outlines
+    if true > 0.4:  # closer, the outlines may overlap
         assert found == pytest.approx(true, abs=2e-3)
     assert found <= max(true, 0) + 2e-3
 

@@ -1,4 +1,4 @@
-"""`restock twin fit` and `gap` of a robot of one's own: driven in the twin, recorded, ingested."""
+"""Run `restock twin fit` and `gap` for a custom robot, recorded in the twin and ingested."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ _INPUTS = ("command", "pose", "wheels", "imu", "scan")
 
 
 def record_drive(profile: Profile, folder: Path) -> Path:
-    """Return a drive under `TRUE` on an empty floor, each command held for a second."""
+    """Record a drive under `TRUE` on an empty floor, with each command held for a second."""
     robot = robot_model(profile.robot, profile.task.body)
     sim = Simulation(1, profile.task, empty_floor(), 0.01, 1, robot=robot)
     spec = EpisodeSpec("nominal", 0)

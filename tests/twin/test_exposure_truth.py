@@ -1,4 +1,4 @@
-"""What the twin says of conditions and exposures: where their causes are, what rules find."""
+"""Check true conditions and exposures of the twin against their causes and the rules."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ def test_truth_limits_follow_robot_size() -> None:
 
 @pytest.mark.long
 def test_truth_matches_cause_and_rules_find_it() -> None:
-    """Compare what is there with the mission, and with what is sensed."""
+    """Compare the truth with the kind of mission, and with the labels from signals."""
     reported: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     conditions: dict[str, set[str]] = {kind: set() for kind in KINDS}
@@ -80,7 +80,7 @@ def test_truth_matches_cause_and_rules_find_it() -> None:
         assert len(reported[name] & true[name]) >= 0.8 * len(true[name])
     for name in ("closing_traffic", "slippery_floor"):
         assert len(reported[name] & true[name]) >= 0.8 * len(reported[name])
-    # Who stands on the plan cannot be told from a pallet.
+    # A person on the plan cannot be distinguished from a pallet.
     assert {kind for kind, _ in reported["plan_blocked"]} <= {"blocked_aisle", "near_collision"}
     for name in ("wheel_slip", "blocked_aisle"):
         assert [kind for kind in KINDS if name in conditions[kind]] == [name]

@@ -1,4 +1,4 @@
-"""`restock twin fit`: segments of a log, their replay, and parameters recovered from recordings."""
+"""Check `restock twin fit`: log segments, their replay, and recovered parameters."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -48,7 +48,7 @@ from restock.train.twin.physics.perturbation import (
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 
 BAGS = SHARED
-# Late, slow and on smaller wheels than anybody told the base; sensors as the stand-in has them.
+# Latency, low gain and smaller wheels than the base assumes; sensors of the stand-in.
 KNOWN = msgspec.structs.replace(
     HARDWARE,
     name="known",
@@ -101,7 +101,7 @@ def test_each_step_is_in_a_segment_or_has_a_reason(known: Path) -> None:
 
 
 def test_late_pose_or_tick_shifts_segments(known: Path) -> None:
-    """Keep segments if poses come in bursts, as a Neato's do."""
+    """Keep segments if poses arrive in bursts, like a Neato's."""
     with Store(known) as store:
         steps = logged_steps(store)
     usual = log_segments(steps, 2.0)

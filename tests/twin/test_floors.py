@@ -1,4 +1,4 @@
-"""Generated floors, floors from TOML and from occupancy maps, and several of them in one twin."""
+"""Check floors: generated, from TOML, from occupancy maps, and several in one twin."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -60,7 +60,7 @@ def test_goals_of_generated_floor_are_reachable(seed: int, kind: str) -> None:
     planner = Planner(floor)
     goals = {planner.cell(x, y) for x, y in floor.goals}
     starts = {planner.cell(*segment.area.center) for segment in floor.segments}
-    # By the one-way rules: all lie in one strongly connected part.
+    # Under the one-way rules, all are in one strongly connected component.
     _, part = csgraph.connected_components(planner._graph, connection="strong")
     assert len({part[cell] for cell in goals | starts}) == 1
     for segment in floor.segments:
@@ -134,7 +134,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
     [
         pytest.param(b"P5\n4 4\n255\nab", "truncated", marks=SAYS_TRUNCATED),
         (b"P5\n99999 99999\n255\n", "exceeds limit"),
-        (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
+        (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # rejected by the header
         (b"P2\n2 1\n9\n1 10", "too large"),
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],
@@ -200,7 +200,7 @@ def test_conditions_that_do_not_fit_the_floor_are_rejected(tmp_path, capsys, she
     message = "has no room for episodes of blocked_aisle"
     with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(2, layouts=str(hall))
-    # A share of 0 is never trained on, yet evaluated.
+    # A condition with share 0 is still evaluated.
     shares = "env.conditions={nominal=1, blocked_aisle=0}"
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, None, [f"env.layouts={hall}", shares])
@@ -209,7 +209,7 @@ def test_conditions_that_do_not_fit_the_floor_are_rejected(tmp_path, capsys, she
     record = ["twin", "record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
     assert main([*record, "--layouts", str(hall)]) != 0
     assert message in capsys.readouterr().err
-    # Without those conditions it is driven on, and sealed goals are reported.
+    # Without those conditions the floor is accepted, and unreachable goals are reported.
     assert "60 of 120 goals cannot be reached" in shell.err(
         *record, "--layouts", hall, "--conditions", "nominal=1", code=0
     )
@@ -234,7 +234,7 @@ def test_one_way_rules_reroute_without_trapping() -> None:
         a and b and after[0] < before[0] - 1e-6
         for a, b, before, after in zip(inside, inside[1:], around, around[1:], strict=False)
     )
-    # East of the robot the lane is shut: it leaves to the west, against the rule.
+    # The lane is closed east of the robot, so the plan goes west, against the rule.
     middle = (lane.x_min + 0.6, lane.center[1])
     out = ruled.plan(*middle, (lane.x_max + 1.0, lane.center[1]), [(2, 5)])
     assert out[:, 0].min() < lane.x_min
@@ -275,7 +275,7 @@ def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.
 @pytest.mark.long
 def test_episode_does_not_depend_on_other_floors() -> None:
     floors = open_floors("default,generated:train:3,narrow:1")
-    # What comes after a bump is drawn among the floors that are there.
+    # Episodes after a bump are drawn from the available floors.
     task = msgspec.structs.replace(load_profile("warehouse_amr").task, bump_terminates=False)
 
     def warehouse(envs: int, floors: Sequence[Warehouse], nthread: int = 1) -> WarehouseVectorEnv:

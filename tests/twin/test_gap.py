@@ -1,4 +1,4 @@
-"""The gap between twin and logs: what it is under a known perturbation, and what is said of it."""
+"""Measure the gap between twin and logs under a known perturbation, and its verdicts."""
 
 import json
 from pathlib import Path
@@ -52,7 +52,7 @@ from restock.train.twin.recording.recorder import RecordingPlan, record
 
 pytestmark = pytest.mark.long
 
-# What the recorded robot is, and the nominal twin is not.
+# Parameters of the recorded robot, which the nominal twin lacks.
 TRUE = Perturbation(
     name="true", payload_kg=30.0, wheel_radius_scale=0.96, latency_s=0.15, gain=0.97
 )
@@ -62,7 +62,7 @@ CONFIG = GapConfig(max_segments=60, limits=TrustLimits(segments=10, episodes=3))
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a store of missions on dry and slippery floor, by a robot with TRUE's parameters."""
+    """Return a store of missions on dry and slippery floor, of a robot with the parameters TRUE."""
     folder = tmp_path_factory.mktemp("gap")
     shares = {"nominal": 0.5, "wheel_slip": 0.5}
     plan = RecordingPlan(missions=14, seed=5, conditions=shares, policy="planner", hardware=TRUE)
@@ -94,7 +94,7 @@ def test_true_parameters_reduce_the_gap(gap, horizon_s):
     )
     assert after < 0.5 * before
     odometry = position(gap, "nominal", "odometry", horizon_s)["median"]
-    assert after < odometry  # whose wheels are not as large as it takes them to be
+    assert after < odometry  # odometry assumes larger wheels
 
 
 def test_slippery_floor_is_untrusted(gap: TwinGap) -> None:
@@ -104,7 +104,7 @@ def test_slippery_floor_is_untrusted(gap: TwinGap) -> None:
         "metres" in verdicts["wheel_slip"].reasons[0] or " m " in verdicts["wheel_slip"].reasons[0]
     )
     assert verdicts["nominal"].verdict == TRUSTED
-    # Right beside a rack the twin touches it where the log's robot did not, which costs most.
+    # Beside racks the twin has contacts that the log lacks, with large penalties.
     assert gap.untrusted == ["recovery", "wheel_slip"]
     assert "reward" in verdicts["recovery"].reasons[0]
     assert any("patches" in line for line in gap.not_done)
@@ -144,7 +144,7 @@ def test_rebuilt_steps_match_the_log(stored: Path) -> None:
     with Store(stored) as store:
         steps = logged_steps(store)
         seen, after = observations(store, steps.transition_id, steps.task.observation_size)
-    assert steps.followed.all()  # the ends of episodes are in the files' metadata
+    assert steps.followed.all()  # episode ends are stored in the files' metadata
     speed = steps.task.observation_names.index("wheel_speed")
     np.testing.assert_array_equal(after[:, speed], steps.after["wheel_speed_mps"])
     np.testing.assert_allclose(
@@ -162,7 +162,7 @@ def test_rebuilt_steps_match_the_log(stored: Path) -> None:
     seen = plans._view(plans.routing.plan, steps.now)
     for name in ROUTE:
         assert np.median(np.abs(seen[name] - steps.now[name])) < 0.02, name
-    # From the logged poses themselves the rebuilt plans show what the robot saw.
+    # With the logged poses, the rebuilt plans reproduce the logged route signals.
     route = plans.seen_after(steps, rows, steps.after)
     np.testing.assert_allclose(route["waypoint_near_x_m"], steps.after["waypoint_near_x_m"])
     np.testing.assert_allclose(plans.progress_m(steps, rows, steps.after), steps.progress_m)

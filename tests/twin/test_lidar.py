@@ -1,4 +1,4 @@
-"""The twin's lidar: compiled ranges are MuJoCo's own, whatever stands and moves on the floor."""
+"""Compare compiled lidar ranges with MuJoCo's, and check what the lidar sees."""
 
 import math
 
@@ -22,7 +22,7 @@ KINDS = {"nominal": 0.2, "wheel_slip": 0.2, "blocked_aisle": 0.3, "near_collisio
 
 
 def environment(layouts: str, robot: Robot | None = None) -> WarehouseVectorEnv:
-    """Return eight robots in all that an episode may hold, a few steps in."""
+    """Return eight robots among pallets, people and forklifts, after 30 steps."""
     env = WarehouseVectorEnv(8, task=TASK, robot=robot, layouts=layouts, conditions=KINDS)
     env.reset(seed=5)
     for _ in range(30):
@@ -37,7 +37,7 @@ def environments() -> list[WarehouseVectorEnv]:
 
 
 def cast_both_ways(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """Return the ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
+    """Return the ranges (8, beams) of compiled code and of MuJoCo."""
     found = []
     for used in (True, False):
         monkeypatch.setattr(native, "IS_USED", used)
@@ -60,7 +60,7 @@ def test_compiled_ranges_match_mujoco(which, places, environments):
     with pytest.MonkeyPatch.context() as patch:
         compiled, cast = cast_both_ways(env, patch)
     np.testing.assert_allclose(compiled, cast, rtol=1e-12, atol=1e-12)
-    assert np.isfinite(compiled).all()  # a floor has walls
+    assert np.isfinite(compiled).all()  # the floor is surrounded by walls
 
 
 @needs_native
@@ -100,7 +100,7 @@ def test_arrays_of_wrong_shape_or_dtype_are_rejected() -> None:
 
 
 def test_people_and_forklifts_stand_on_the_floor() -> None:
-    """Check heights: a forklift once hung .4 m above the floor, unseen by any lidar."""
+    """Regression: forklifts were .4 m above the floor, where no lidar saw them."""
     env = WarehouseVectorEnv(64, task=TASK, conditions={"near_collision": 1.0})
     env.reset(seed=0)
     simulation, handles = env.simulation, env.simulation.handles
@@ -131,7 +131,7 @@ def test_true_clearance_covers_lidar_blind_spot(lidar: LidarLimits) -> None:
     env.reset(seed=2)
     x, y, yaw = env.simulation.pallets[0, 0]
     half = pallet_half_m(np.array([yaw]))[0, 0]
-    # Backed up to a pallet, .1 m short of it.
+    # The robot's back is .1 m from a pallet.
     env.simulation.place_robot(0, x + half + 0.35 + 0.1, y, 0.0)
     *_, info = env.step(np.zeros(1, np.int64))
     assert "near_collision" in info["true_condition"][0]

@@ -1,4 +1,4 @@
-"""Packed columns are the bytes rosbags would have written, and the sinks keep every message."""
+"""Compare packed messages with the bytes that rosbags writes, and check the sinks."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ STAMP_NS = 1_760_000_000_123_456_789
 )
 @settings(max_examples=60)
 def test_packed_messages_match_rosbags(frame, names, ranges):
-    """Check alignment after strings and sequences of any length, empty ones too."""
+    """Check alignment after strings and sequences of any length."""
     numbers = np.arange(len(names), dtype=float)
     for shape, columns in [
         (

@@ -1,4 +1,4 @@
-"""A kind of mission is one file: a new one is staged, driven, scored, measured and drawn."""
+"""Add a kind of mission in one file: it is staged, driven, scored and drawn."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""A missions file in the twin: which missions it makes, and which it refuses by name."""
+"""Check missions files in the twin: the missions that they order, and rejected orders."""
 
 from collections import Counter
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_rounds_continue_until_enough_missions_count() -> None:
     for one_round in missions.rounds():
         for number, mission in enumerate(one_round):
             driven.append(mission)
-            # Every second slip is met, a near collision never.
+            # Every second wheel slip occurs, and no near collision does.
             missions.note(mission, observed=mission.order == 0 and number % 2 == 0)
     kinds = [mission.spec.condition for mission in driven]
     assert kinds.count("near_collision") == MAX_DRIVEN * 2
@@ -118,7 +118,7 @@ def test_record_counts_missions_by_observed_condition(tmp_path, shell):
 
 @pytest.mark.slow
 def test_recorded_missions_close_coverage_gaps(tmp_path, shell):
-    """Drive what is missing and measure again: gaps are closed, or within their intervals."""
+    """Record the missing missions and measure again: gaps are closed or within their intervals."""
 
     run = shell.json
     store, requested = str(tmp_path / "store"), tmp_path / "asked.toml"
@@ -149,7 +149,7 @@ def test_recorded_missions_close_coverage_gaps(tmp_path, shell):
 def draw_specs(
     missions: tuple[MissionOrder, ...], share: float, count: int = 400
 ) -> list[EpisodeSpec]:
-    """Return the episodes that one of two environments begins."""
+    """Return the episodes that one of two environments starts."""
     queue = EpisodeQueue(2, [FLOOR], {"nominal": 1.0}, None, seed=5)
     if missions:
         queue.follow(orders(*missions), share)
@@ -172,7 +172,7 @@ def test_run_config_keeps_missions_as_practice(tmp_path: Path) -> None:
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "cross_east"\n')
     settings = [f"env.missions={str(file)!r}", "env.missions_share=0.25"]
     prepared = prepare_new(tmp_path / "run", None, None, settings)
-    file.unlink()  # what is in a file may change: the run keeps what it was
+    file.unlink()  # the run keeps a copy, since the file may change
     kept = prepared.document["config"]["env"]
     assert kept["missions"][0]["zone"] == "cross_east"
     assert parse_config(prepared.document["config"], where="kept") == prepared.config

@@ -1,4 +1,4 @@
-"""The twin's physics against hand physics, within 15 %, and against itself at a finer timestep."""
+"""Compare the twin's physics with hand calculations within 15 %, and with a finer timestep."""
 
 from functools import cache
 
@@ -59,7 +59,7 @@ def drive(sim: Simulation, speed: float, yaw_rate: float, seconds: float) -> Non
 
 
 def wheel_share() -> float:
-    """Return the share of the robot's weight that the driven wheels carry, standing."""
+    """Return the share of a standing robot's weight that is on the driven wheels."""
     model, _ = build_model(default_warehouse(), stand_in(TASK.body))
     data = mujoco.MjData(model)
     data.qpos[:3] = 6.0, 5.0, 0.1

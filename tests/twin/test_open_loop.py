@@ -1,4 +1,4 @@
-"""One reader of logged steps and one driver of logged commands, for the fit and for the gap."""
+"""Check the reader of logged steps and the open-loop driver that fit and gap share."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,7 +82,7 @@ def test_fit_and_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None
         stored = np.asarray(table[name], np.float64)
         assert np.array_equal(stored, steps.now[name])
         assert np.array_equal(stored[rows], cut.signals[name][:, :-1])
-        # What the gap takes for the next step is what ends the fit's segment.
+        # The gap's next step is the end of the fit's segment.
         assert np.array_equal(steps.after[name][rows[:, -1]], cut.signals[name][:, -1])
     commanded = np.asarray(table["command_speed_mps"], np.float64)
     assert np.array_equal(commanded[rows], cut.command[:, cut.warmup_steps :, 0])

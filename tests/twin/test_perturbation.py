@@ -1,4 +1,4 @@
-"""Perturbations: what they say, what the sensors make of them, and that rows say which held."""
+"""Check perturbations: their files, their effect on sensors, and their record in rows."""
 
 import json
 from itertools import pairwise
@@ -63,7 +63,7 @@ def test_perturbation_from_name_file_or_table(tmp_path: Path) -> None:
 
 
 def drive(steps: int = 6, **changed: float) -> list[dict[str, np.ndarray]]:
-    """Return the signals of one robot on a fixed drive, from its first step on."""
+    """Return the signals of one robot on a fixed drive, step by step."""
     env = WarehouseVectorEnv(1, perturbation=Perturbation(**changed))
     env.set_episodes([EpisodeSpec("nominal", 7)])
     env.reset(seed=0)
@@ -85,7 +85,7 @@ def test_slow_localisation_keeps_pose_and_stamp() -> None:
     np.testing.assert_allclose(age_s, [0, 0.2, 0.4, 0, 0.2, 0.4, 0], atol=1e-9)
     x = [s["pose_x_m"][0] for s in seen]
     assert x[0] == x[1] == x[2] != x[3] == x[4] == x[5] != x[6]
-    # No new pose is no evidence of motion: the wheels' speed stands in.
+    # Without a new pose, the wheel speed is used.
     assert seen[2]["localised_speed_mps"] == seen[2]["wheel_speed_mps"]
 
 
@@ -118,7 +118,7 @@ def test_localisation_drift_is_autoregressive() -> None:
         )[:, 3:5]
         drawn[1:] *= np.sqrt(1 - keep**2)
         drawn[:] = lfilter([1.0], [1.0, -keep], drawn, axis=0)
-        assert np.array_equal(walk, drawn)  # to the bit: episodes of earlier runs stay as they were
+        assert np.array_equal(walk, drawn)  # bit-identical, as in earlier runs
         walks.append(walk)
     assert 0.5 < np.var(walks) < 1.5
 

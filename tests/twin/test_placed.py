@@ -1,4 +1,4 @@
-"""A drive is told to be on a floor by where it went and by the walls that its lidar saw."""
+"""Match drives with floors by the poses and by the walls that the lidar saw."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_other_walls_rule_a_floor_out(drive: Drive) -> None:
     hall = replace(FLOOR, racks=())  # open ground: all of its poses fit
     assert on_free_ground(hall, drive.places_m).all()
     assert not placed_on(hall, drive)
-    assert placed_on(hall, Drive(drive.places_m, np.empty((0, 2))))  # no lidar: nothing against it
+    assert placed_on(hall, Drive(drive.places_m, np.empty((0, 2))))  # without a lidar
     assert not placed_on(OTHER, drive)
 
 

@@ -1,4 +1,4 @@
-"""Plans on the known map, and blocks found from the lidar alone."""
+"""Check plans on the known map, and blocks found by the lidar."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_plan_avoids_closed_aisle() -> None:
 
 
 def test_latest_closure_reopens_if_goal_is_unreachable() -> None:
-    # Both ends of the goal's aisle segment: there is no way in.
+    # Both ends of the goal's aisle segment are closed.
     plan = PLANNER.plan(3.0, 3.6, (8.45, 0.9), [(1, 0), (1, 8)])
     np.testing.assert_allclose(plan[-1], (8.45, 0.9))
 

@@ -1,4 +1,4 @@
-"""The scripted drivers do what their names promise, and say who drove and how likely."""
+"""Check the scripted drivers: success rates, handovers and action probabilities."""
 
 from collections import Counter
 
@@ -64,13 +64,13 @@ def test_operator_mostly_succeeds_in_every_condition(kind: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("layouts", ["default", "generated:test"])
 def test_operator_gets_past_pallets(layouts: str) -> None:
-    """Drive through the gap if there is one, else around, on floors of any kind."""
+    """Drive through the gap if there is one, else around the block."""
     passed = success(Operator(epsilon=0.0), "blocked_aisle", layouts=layouts)
     assert min(passed.values()) >= 0.9
 
 
 class CountingHandover(Handover):
-    """A pair of drivers whose handovers are counted, by whether the operator took over."""
+    """Planner and operator with a counter of handovers, keyed by `to_operator`."""
 
     def __init__(self) -> None:
         super().__init__(PlannerFollower(), Operator())
@@ -108,13 +108,13 @@ def test_reported_probabilities_match_actions(make: type[PlannerFollower]) -> No
         assert (probability > 0).all()
         epsilon = np.where(certain, 0.0, policy.epsilon)
         expected = epsilon / count + np.where(action == chosen, 1 - epsilon, 0.0)
-        if make is not Operator:  # whose tries when standing still are its own draws
+        if make is not Operator:  # its attempts while standing still are drawn separately
             np.testing.assert_allclose(probability, expected)
         assert (policy.acting == policy.name).all()
 
 
 def test_lattice_guides_stuck_operator() -> None:
-    """Get a real Neato's outline through passages of .5 m, which it was stuck before."""
+    """Regression: a robot with a Neato's outline was stuck before passages of .5 m."""
     env = WarehouseVectorEnv(4, conditions={"nominal": 1.0})
     first = Operator(seed=6)
     observation, _ = env.reset(seed=3)
@@ -137,7 +137,7 @@ def test_lattice_guides_stuck_operator() -> None:
 
 
 def test_slow_moving_robot_is_not_stuck() -> None:
-    """Drive at .28 m/s, less than .1 m in the steps after which a robot counts as stuck."""
+    """Drive so slowly that the robot moves less than .1 m in the steps of the stuck check."""
     task = load_profile("warehouse_amr").task
     slow = tuple((0.28 * v, w) for v, w in task.actions)
     task = msgspec.structs.replace(task, actions=slow)
@@ -175,7 +175,7 @@ def small_slow_robot() -> Task:
 
 
 def test_small_robot_drives_through_narrow_gap() -> None:
-    """Drive on: it once turned left and right before gaps too narrow for the stand-in."""
+    """Regression: the robot turned left and right before gaps too narrow for the stand-in."""
     gap = Rect(1.5, 0.0, 2.5, 0.8), Rect(1.5, 1.2, 2.5, 2.0)
     ends = (3.4, 1.0), (0.6, 1.0)
     floor = Warehouse(

@@ -1,4 +1,4 @@
-"""What a robot would have logged of a drive: rates, three times a message, the policy's view."""
+"""Check the messages of a drive: rates, the three times of a message, and frames."""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -130,7 +130,7 @@ def test_stamp_precedes_publish_and_log_time(messages: list[Message]) -> None:
 
 
 def test_replaced_plan_is_not_repeated(drive: Drive) -> None:
-    # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
+    # In floating point, the plan of 1.2 s is due again one bit before 2.2 s.
     changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
     plans = _decoded(_robot().publish(changed, START_NS))["/plan"]
     assert [len(value.poses) for _, value in plans] == [5, 7, 7]

@@ -1,4 +1,4 @@
-"""The recorder: the same seed gives the same bytes, any policy drives, nothing is half-done."""
+"""Check the recorder: identical bytes for a seed, policies, options and interruptions."""
 
 import json
 import signal
@@ -35,7 +35,7 @@ from restock.train.twin.recording.recorder import (
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "file_format"), [("a.mcap", "mcap"), ("a", "rosbag2")])
 def test_recording_keeps_tags_and_start_time(tmp_path, name, file_format):
-    """As ingest reads it; what was driven is in both formats by tests/ingest/test_round_trip.py."""
+    """Read tags and start time with ingest; tests/ingest/test_round_trip.py compares the drive."""
     tags, start_ns = {"robot": "amr-07", "line": "007"}, parse_start("2026-10-05T10:00+02:00")
     plan = RecordingPlan(format=file_format, missions=1, seed=3, tags=tags, start_ns=start_ns)
     record(tmp_path / name, plan)
@@ -152,7 +152,7 @@ def test_record_options_are_parsed() -> None:
 
 
 class _Creeper:
-    """A user's own policy."""
+    """Custom policy with a name and a version."""
 
     name, version = "creeper", "3"
 

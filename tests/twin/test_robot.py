@@ -1,4 +1,4 @@
-"""A profile's robot in the twin: it drives what it is commanded; the stand-in is as it was."""
+"""Check robots of profiles in the twin, and that the stand-in is unchanged."""
 
 import hashlib
 import math
@@ -66,7 +66,7 @@ def drive_steadily(
 
 
 def test_stand_in_model_is_unchanged() -> None:
-    """Every number of it."""
+    """Compare a hash of all numbers of the model."""
     model, _ = build_model(default_warehouse(), stand_in(AMR.task.body))
     arrays = [
         np.asarray(getattr(model, name))
@@ -104,7 +104,7 @@ def test_robot_follows_commands(name: str) -> None:
 
 
 def test_skid_steer_turn_depends_on_friction() -> None:
-    """Compare skid steer, whose wheels scrub in every turn, with one axle."""
+    """Compare skid steer, whose wheels slide in every turn, with one axle."""
     sim, _ = drive_steadily(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)
     one_axle = msgspec.structs.replace(HUSKY, drive="differential", wheelbase_m=None)
@@ -118,7 +118,7 @@ def test_skid_steer_turn_depends_on_friction() -> None:
 
 
 def test_lidar_mounting_follows_profile() -> None:
-    """A wall ahead is seen by the beam that looks there, also from a lidar mounted backward."""
+    """See a wall with the beam that points at it, also if the lidar points backward."""
     body = Body(0.4, 0.4, lidar_x_m=0.1, lidar_yaw_rad=math.pi)
     lidar = Lidar(z_m=0.3, beams=181, angle_min_rad=-math.pi / 2, angle_max_rad=math.pi / 2)
     robot = Robot(axle_x_m=0.05, lidar=lidar)

@@ -1,4 +1,4 @@
-"""Robots that steer, and omnidirectional ones: what they drive, what they cannot, and how."""
+"""Check Ackermann and omnidirectional robots: commands, limits and perturbations."""
 
 import math
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_turning_radius_is_limited_by_steering() -> None:
     assert CAR.min_turning_radius_m == pytest.approx(TIGHTEST_M)
     _, steady = drive_steadily(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
     assert steady[0] == pytest.approx([0.3, 0.3 / TIGHTEST_M], rel=0.02)
-    assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # it stands, its wheels turned
+    assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # the robot stands with turned wheels
 
 
 def test_steering_rate_is_limited() -> None:
@@ -63,8 +63,8 @@ def test_steering_rate_is_limited() -> None:
         task, start, [Perturbation(latency_s=0.0)], robot=robot_model(robot, OUTLINE)
     )
     turn = result.signals["gyro_yaw_rate_radps"][0, 0]
-    # .2 and .4 s after the command its wheels have steered so far, and not yet .56 rad.
-    assert 0.05 < turn[1] < 0.4 * math.tan(0.2) / 0.5 + 0.01  # its speed ramps too
+    # After .2 and .4 s the wheels have steered by .2 and .4 rad, not yet .56 rad.
+    assert 0.05 < turn[1] < 0.4 * math.tan(0.2) / 0.5 + 0.01  # the speed ramps up too
     assert 0.25 < turn[2] < 0.4 * math.tan(0.4) / 0.5 + 0.01
     assert turn[-1] == pytest.approx(0.0, abs=0.01)
 
@@ -83,7 +83,7 @@ def test_unsteerable_action_is_rejected(action, message):
 
 
 def test_unsteerable_profile_is_read_from_store_only(tmp_path: Path) -> None:
-    """Older stores hold such profiles: their rows can be learnt from, without a twin."""
+    """Read such profiles from older stores, whose rows can be learnt from without a twin."""
     text = profile_toml(amr_with('\n[robot]\ndrive = "ackermann"\nwheelbase_m = 0.4\n'))
     (tmp_path / "car.toml").write_text(text)
     with pytest.raises(ConfigError, match="turns on the spot"):
@@ -117,7 +117,7 @@ def test_omnidirectional_robot_follows_commands() -> None:
 
 
 def test_perturbations_apply_to_each_drive_type() -> None:
-    """A gain, a worn wheel and a longer way to the wheels: each drive shows them as it must."""
+    """Apply a gain, a smaller wheel and a payload to each drive type."""
     seen = {}
     for robot, body in ((CAR, OUTLINE), (MECANUM, Body(0.6, 0.5))):
         task = Task(body=body, actions=((0.0, 0.0), (0.8, 0.0)))
@@ -142,5 +142,5 @@ def test_perturbations_apply_to_each_drive_type() -> None:
         assert way[1:3] == pytest.approx([0.9, 0.95], abs=0.015)
         assert way[4] == pytest.approx(1.0, abs=0.02)
         seen[robot.drive] = result.pose[3, 0, -1, 2]
-    assert seen["omnidirectional"] > 0.1  # its left wheels lag, and it turns to the left
-    assert abs(seen["ackermann"]) < 0.02  # its front wheels hold it straight
+    assert seen["omnidirectional"] > 0.1  # the left wheels lag, so the robot turns left
+    assert abs(seen["ackermann"]) < 0.02  # the front wheels keep it straight

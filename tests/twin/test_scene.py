@@ -1,4 +1,4 @@
-"""The scene of a mission as a viewer gets it: markers, parameters, frames, map, and their QoS."""
+"""Check the recorded scene of a mission: markers, perturbation, frames, map and their QoS."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""The state lattice: which gaps the body fits through, and how it must stand to do so."""
+"""Check the state lattice: gaps that the body fits through, and the yaw that it needs."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ GOAL = (AISLE.x_max + 1.2, AISLE.center[1])  # in the cross-aisle behind it
 
 
 def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GOAL) -> StateLattice:
-    """Return aisle 1 east with a pallet against its north rack and this much room south of it."""
+    """Return aisle 1 east with a pallet at its north rack and a gap of `gap_m` south of it."""
     half = np.array([[0.6, (AISLE.y_max - AISLE.y_min - gap_m) / 2]])
     box = np.array([[AISLE.center[0], AISLE.y_max - half[0, 1], 0.0]])
     planner = Planner(FLOOR)
@@ -53,7 +53,7 @@ def test_tight_gap_needs_straight_entry() -> None:
     in_gap = (AISLE.center[0], AISLE.y_min + 0.375)
     straight, askew = (lattice.time_s(np.array([*in_gap, yaw])) for yaw in (0.0, 1.2))
     assert askew > straight + 0.5
-    assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it would have to back out
+    assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it must reverse out
 
 
 def test_remaining_time_scales_with_speed() -> None:
@@ -72,7 +72,7 @@ def test_near_clearance_is_exact(layouts, way, monkeypatch):
     middle = rng.uniform((0.0, 0.0), (floor.width_m, floor.depth_m), (200, 2))
     x, y = np.moveaxis(middle[:, None] + rng.uniform(-0.6, 0.6, (200, 12, 2)), -1, 0)
     own = np.concatenate([middle + 0.5, np.full((200, 2), 0.2)], axis=1)
-    own[100:, :2] = np.inf  # not there
+    own[100:, :2] = np.inf  # absent
     of_own = box_gap(x, y, own[:, :2].T[..., None], own[:, 2:].T[..., None])
     racks = floor.rack_boxes.T
     of_racks = box_gap(x[..., None], y[..., None], racks[:2], racks[2:]).min(axis=-1, initial=9.0)

@@ -1,4 +1,4 @@
-"""The floor that a recording shows: its map, the way driven, and what is refused."""
+"""Make floors from recordings: from the map, the scans or the driven corridor."""
 
 import re
 from functools import cache
@@ -44,7 +44,7 @@ def hall() -> np.ndarray:
 
 
 def lap(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return poses (N, 3) once around the hall, along its corridors' middle, in the map's frame."""
+    """Return poses (N, 3) of one lap in the middle of the hall's corridors, in the map frame."""
     corners = np.array([[0.95, 0.95], [8.05, 0.95], [8.05, 6.05], [0.95, 6.05], [0.95, 0.95]])
     parts = []
     for start, end in pairwise(corners):
@@ -58,7 +58,7 @@ def lap(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def topic(frame: str, count: int, fields: dict[str, Any], late_s: float = 0.0) -> TopicColumns:
-    """Return messages every .2 s, whose stamps are late by so much."""
+    """Return messages every .2 s with stamps that are late by `late_s`."""
     log_ns = 10**9 + np.arange(count) * 2 * 10**8
     stamped = {"header.stamp": log_ns + int(late_s * 1e9)}
     return TopicColumns(
@@ -80,10 +80,10 @@ def write_bag(
     frame: str = "map",
     grid: OccupancyGrid | None = None,
     data: np.ndarray | None = None,
-    scanned: bool = False,  # by a lidar of 120 beams, on a lap of the hall
+    scanned: bool = False,  # with /scan of 120 beams, on a lap of the hall
     scans_late_s: float = 0.0,
     scan_frame: str = "laser",
-    clockwise: bool = False,  # as a lidar that hangs upside down
+    clockwise: bool = False,  # like a lidar that is mounted upside down
 ) -> Path:
     """Write a rosbag2 folder with /amcl_pose every .2 s, and /map with the grid or `data`."""
     topics: dict[str, TopicColumns] = {}
@@ -132,7 +132,7 @@ def test_scan_map_uses_best_matching_clock(tmp_path, late_s, frame):
     made = survey(bag, by="scans", footprint=parse_footprint("0.4x0.4"))
     assert f"by {'log time' if late_s else 'header stamps'}" in made.source
     assert len(made.floor.segments) == 4
-    assert survey(bag).by == "map"  # which is better known
+    assert survey(bag).by == "map"  # the map in the bag is preferred
 
 
 def test_upside_down_lidar_gives_the_same_map(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_poses_off_the_map_are_rejected_with_frames(tmp_path: Path) -> None:
 
 
 def test_map_contradicted_by_lidar_is_rejected(tmp_path, shell):
-    """Refuse a larger, empty room: all poses are on its free floor, but its walls are elsewhere."""
+    """Reject a larger, empty room: all poses are on free floor, but the walls are elsewhere."""
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
     elsewhere = OccupancyGrid(room, CELL_M, (-1.5, -1.5, 0.0))
@@ -202,8 +202,8 @@ def test_map_contradicted_by_lidar_is_rejected(tmp_path, shell):
     assert "only 0% of the lidar's returns are on walls of the map" in error
     assert "--by scans" in error
     assert not floor.exists()
-    assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # it was asked for
-    near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # of a robot that is badly localised
+    assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # explicitly requested
+    near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # as with poor localisation
     made = survey(write_bag(tmp_path / "near", poses=lap(), grid=near, scanned=True))
     assert any("of the lidar's returns are on walls" in note for note in made.notes)
 
@@ -243,9 +243,9 @@ def test_without_map_floor_is_driven_corridor(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, 0.5)), frame="odom")
     made = survey(bag)
     assert made.by == "corridor"
-    # Its axes run along the way, which is turned by half a radian.
+    # The floor's axes follow the corridor, which is turned by half a radian.
     assert made.floor.map_origin[2] == pytest.approx(0.5, abs=0.01)
-    # 7.1 x 5.1 m from middle to middle, and around them .43 m to turn, .07 and .25 m.
+    # 7.1 x 5.1 m between corridor middles, plus .43 m to turn, .07 m and .25 m on each side.
     assert made.floor.width_m == pytest.approx(7.1 + 2 * 0.75, abs=0.15)
     assert made.floor.depth_m == pytest.approx(5.1 + 2 * 0.75, abs=0.15)
     assert len(made.floor.segments) == 4
@@ -269,7 +269,7 @@ def test_exported_zones_are_in_map_frame(tmp_path: Path, yaw: float) -> None:
         held = zone.holds(on_map[:, 0], on_map[:, 1])
         assert held[sure].all()
         assert not held[outside].any()
-    # A profile's hash does not know of a turn that is not given.
+    # Zones without a turn do not change a profile's hash.
     assert msgspec.to_builtins(Zone("a", (0.0, 0.0, 1.0, 1.0))).keys() == {"name", "box_m"}
 
 
@@ -291,7 +291,7 @@ def test_floor_picture_is_to_scale(tmp_path: Path) -> None:
 
 
 def rows_along(rows: pa.Table, poses: np.ndarray, rows_a_pose: int = 1) -> pa.Table:
-    """Return rows at these poses (N, 3), and then at the last."""
+    """Return rows at these poses (N, 3), and the remaining rows at the last pose."""
     pose_index = np.minimum(np.arange(len(rows)) // rows_a_pose, len(poses) - 1)
     names = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
     return replaced(rows, dict(zip(names, poses[pose_index].T, strict=True)))
@@ -311,7 +311,7 @@ def test_store_gives_floor_of_its_recordings(tmp_path):
     manifests.update(updates={"source_file": f"'{bag}'"})
     made = survey(store)
     assert made.by == "map"
-    # Missions go where any of the drives on this map was.
+    # Missions go to the places of all drives on this map.
     assert made.poses is not None
     assert "2 recordings" in made.poses.source
 
@@ -346,7 +346,7 @@ class _Zones(Checked, frozen=True):
 
 
 def test_missions_of_barely_moved_robot_use_seen_room() -> None:
-    """Send missions into the room that it saw if its own places are too close together."""
+    """Send missions into the room that the robot saw if its own positions are close together."""
     cells = np.full((120, 80), 100, np.int8)
     cells[2:-2, 2:-2] = 0
     around = np.array([(3.65, 2.65), (3.75, 2.65), (3.75, 2.75)])  # in three squares

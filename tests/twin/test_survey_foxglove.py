@@ -22,9 +22,9 @@ def test_scans_are_placed_at_robot_pose(tmp_path: Path, encoding: str) -> None:
         poses = choose_poses(candidate_poses(recording), lambda at_m: np.ones(len(at_m), np.bool_))
         assert poses is not None
         [scans] = placed_scans(recording, poses, None, None)
-    assert len(scans) == 100  # of 200: the others were taken before it moved 5 cm
+    assert len(scans) == 100  # of 200; the others were taken before the robot moved 5 cm
     assert scans.source.startswith("scans of /scan")
-    centre = np.array([0.0, 2.0])  # of the circle that it drives
+    centre = np.array([0.0, 2.0])  # of the driven circle
     radius = np.hypot(*(scans.origin_m - centre).T)
     assert radius == pytest.approx(2.0, abs=0.02)
     for origin, hit, order in zip(scans.origin_m, scans.hit_m, scans.order, strict=True):

@@ -1,4 +1,4 @@
-"""Tracks in the twin, where the truth is known: by the code that makes them from logs."""
+"""Compare tracked people with the truth in the twin."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""The twin's environments: Gymnasium's rules, determinism, state, and the contract."""
+"""Check the twin's environments: Gymnasium's rules, determinism, state and the task's functions."""
 
 import json
 import pickle
@@ -27,7 +27,7 @@ BRIEF = msgspec.structs.replace(load_profile("warehouse_amr").task, time_limit_s
 
 
 def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
-    """Return everything that `steps` random steps give, as arrays."""
+    """Return all results of `steps` random steps, as arrays."""
     rng = np.random.default_rng(seed)
     seen = []
     for action in rng.integers(env.single_action_space.n, size=(steps, env.num_envs)):
@@ -86,7 +86,7 @@ def test_episode_does_not_depend_on_its_slot() -> None:
 @pytest.mark.long
 def test_saved_state_resumes_bit_exactly(env, tmp_path):
     env.reset(seed=2)
-    env.simulation.apply(0, Perturbation(payload_kg=10.0))  # restored by the episode's own
+    env.simulation.apply(0, Perturbation(payload_kg=10.0))  # replaced by the episode's own on reset
     env.reset(seed=2)
     roll(env, 260, 0)  # across episode ends
     checkpoint.save(tmp_path / "state", env.state_dict())
@@ -120,7 +120,7 @@ def test_unpickled_environment_has_same_settings(pickler: str) -> None:
     np.testing.assert_array_equal(again.reset()[0], first)
     assert again.perturbation.name == "friction"
     assert set(again.episode_condition) == {"wheel_slip"}
-    roll(made, 1, 0)  # it goes on itself
+    roll(made, 1, 0)  # the original continues
 
     single = gymnasium.make("restock/Warehouse-v0", seed=7, action="continuous")
     other = pickle.loads(dumps(single))
@@ -139,7 +139,7 @@ def test_autoreset_keeps_the_final_observation() -> None:
         done = terminated | truncated
         if done.any():
             np.testing.assert_array_equal(info["_final_obs"], done)
-            np.testing.assert_array_equal(info["episode_seed"], before)  # of the one that ended
+            np.testing.assert_array_equal(info["episode_seed"], before)  # of the ended episode
             assert (env.episode_seed[done] != before[done]).all()
             assert (env.steps[done] == 0).all()
             assert not np.array_equal(info["final_obs"][done], observation[done])
@@ -159,7 +159,7 @@ def test_disabled_autoreset_resets_masked_environments() -> None:
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 def test_step_matches_task_functions_and_fills_signals(kind: str) -> None:
-    """A command counts as its nearest action: it is seen and rewarded so."""
+    """Observe and reward a continuous command as its nearest action."""
     env = WarehouseVectorEnv(8, action=kind)
     env.reset(seed=6)
     env.action_space.seed(0)
@@ -234,7 +234,7 @@ def test_divergence_truncates_episode_and_is_counted(env, tmp_path, monkeypatch)
     np.testing.assert_array_equal(info["final_obs"][3], before[3])
     observation, *_, info = env.step(np.full(8, 2))
     assert not info["invalid"].any()
-    assert not list(tmp_path.iterdir())  # and no MUJOCO_LOG.TXT where the user stands
+    assert not list(tmp_path.iterdir())  # no MUJOCO_LOG.TXT in the working directory
 
 
 def test_block_callback_samples_true_motion() -> None:

@@ -1,4 +1,4 @@
-"""The twin of a robot without a lidar: the same drive, seen without it, by the logs' contract."""
+"""Check the twin of a robot without a lidar."""
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ STEPS = 12
 
 
 def drive(task):
-    """Return observations, rewards and signals of the same actions on the same episodes."""
+    """Return observations, rewards, tight clearances and the environment of a fixed drive."""
     env = WarehouseVectorEnv(2, task=task, seed=3, nav_command=False)
     observation, _ = env.reset(seed=3)
     seen, earned, tight, over = [observation], [], [], []
