@@ -46,11 +46,9 @@ def test_untestable_fleet_is_reported(tmp_path, shell):
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
-    message = (
-        "Nothing could be tested: every robot drove in one week only, so none has a reference."
-    )
+    reason = "Nothing could be tested: every robot drove in one week only, so none has a reference."
     for text in (page.read_text("utf-8"), out):
-        assert message in text
+        assert reason in text
         assert "at least 5 episodes in each" in text
         assert "no change that matters" not in text.lower()
 
@@ -62,7 +60,5 @@ def test_no_change_is_reported_with_number_of_tests(tmp_path, shell):
     tests = sum(row["p"] is not None for row in own)
     assert document["findings"] == []
     assert document["tested"] == tests > 0
-    message = (
-        f"No change that matters was found in {tests} tests against the robots' own references"
-    )
-    assert message in shell.out("coverage", "drift", store)
+    text = f"No change that matters was found in {tests} tests against the robots' own references"
+    assert text in shell.out("coverage", "drift", store)

@@ -63,12 +63,10 @@ FAULTS = [  # audit, number of rows found, part of the first row, SQL that plant
 ]
 
 
-def findings_of(
-    tables: Tables, names: list[str], sql: str = "", **stricter: float
-) -> list[Finding]:
+def findings_of(tables: Tables, names: list[str], sql: str = "", **limits: float) -> list[Finding]:
     """Return the findings of audits after `sql` has changed the tables."""
     thresholds = load_thresholds()
-    chosen = {n: thresholds[n] | stricter for n in names if AUDITS[n].parameters}
+    chosen = {n: thresholds[n] | limits for n in names if AUDITS[n].parameters}
     with duckdb.connect() as connection:
         connection.execute("CREATE MACRO number(name) AS right(name, 1)::INTEGER")
         views_over(connection, *tables, planted=TABLE.sub(r"\1 stored_\2", sql))
@@ -182,9 +180,8 @@ HELD_OUT = "CREATE OR REPLACE VIEW panel.evaluation_split AS SELECT *, '{}' AS s
 def test_leak_from_evaluation_split_is_found(store_path, panels, by):
     leak, spoilt = LEAKS[by]
     assert finding_on(store_path, "leakage", panel=panels[by]).status == "pass"
-    finding = finding_on(
-        store_path, "leakage", HELD_OUT.format(by, f"({spoilt})"), panel=panels[by]
-    )
+    spoil = HELD_OUT.format(by, f"({spoilt})")
+    finding = finding_on(store_path, "leakage", spoil, panel=panels[by])
     assert finding.status == "fail"
     assert leak in {row["leak"] for row in finding.sample}
 
@@ -313,16 +310,14 @@ def test_findings_do_not_depend_on_cached_tables(tmp_path, monkeypatch):
         monkeypatch.setattr(definitions, "FEW_SUMMARISED_ROWS", summarised_rows)
         tables: list[str] = []
 
-        def note_cached(_: str) -> None:
+        def note(_: str) -> None:
             held = store.bare.sql("SELECT table_name FROM duckdb_tables()").fetchall()
             tables[:] = {"transitions", "stored_summaries"}.intersection(name for (name,) in held)
 
         with Store(tmp_path / "store") as store:
-            found = run_audits(
-                store.connection, shipped_audits(), load_thresholds(), done=note_cached
-            )
+            found = run_audits(store.connection, shipped_audits(), load_thresholds(), done=note)
             kept[rows, summarised_rows] = sorted(tables)
-            note_cached("")
+            note("")
             assert not tables
             counted = store.sql("SELECT count(reward) FROM transitions").fetchall()
             assert counted == [(sum(map(len, written)),)]  # from the files again

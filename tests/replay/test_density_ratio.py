@@ -93,25 +93,17 @@ def test_density_ratio_keeps_risky_states_boosted():
     drawn = (shares / np.bincount(code))[code]
     risky = chance > 0.3
 
-    def risky_share(correction: str, given: NDArray[np.float32] | None = None) -> float:
-        rule = CorrectionRule(clip=50.0)
-        weight = importance_weights(code, state, strata(correction), shares, rule, given)
-        return float((drawn * weight)[risky].sum())
-
-    natural = risky.mean()
-    assert risky_share("full") == pytest.approx(natural, rel=0.01)
-    assert risky_share("density_ratio", outcome) == pytest.approx(drawn[risky].sum(), rel=0.05)
-    assert drawn[risky].sum() > 2.5 * natural
-    # Its effective count is between those of full and of no correction.
-    effective = {
-        name: effective_count(
-            drawn
-            * importance_weights(
-                code, state, strata(name), shares, CorrectionRule(clip=50.0), given
-            )
-        )
+    weighted = {
+        name: drawn
+        * importance_weights(code, state, strata(name), shares, CorrectionRule(clip=50.0), given)
         for name, given in (("none", None), ("density_ratio", outcome), ("full", None))
     }
+    natural = risky.mean()
+    assert weighted["full"][risky].sum() == pytest.approx(natural, rel=0.01)
+    assert weighted["density_ratio"][risky].sum() == pytest.approx(drawn[risky].sum(), rel=0.05)
+    assert drawn[risky].sum() > 2.5 * natural
+    # Its effective count is between those of full and of no correction.
+    effective = {name: effective_count(weights) for name, weights in weighted.items()}
     assert effective["full"] == pytest.approx(COUNT, rel=1e-3)
     assert effective["none"] < effective["density_ratio"] < effective["full"]
 

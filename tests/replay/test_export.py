@@ -250,9 +250,8 @@ def test_d3rlpy_reads_exports_and_trains(store_path, tmp_path):
             np.testing.assert_allclose(actions, t.actions, rtol=1e-6)
             np.testing.assert_allclose(episode["rewards"], t.rewards, rtol=1e-6)
             np.testing.assert_allclose(episode["first"], t.observations[:-1, 0], rtol=1e-6)
-            steps = (
-                slice(1, -1) if t.terminated else slice(1, None)
-            )  # d3rlpy gives zeros after the terminal step
+            # d3rlpy gives zeros after a terminal step.
+            steps = slice(1, -1) if t.terminated else slice(1, None)
             expected_next = t.observations[steps, 0]
             np.testing.assert_allclose(episode["next_first"][: len(expected_next)], expected_next)
             assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]

@@ -12,9 +12,7 @@ from restock.errors import ConfigError, MixtureError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.places import open_place
-from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import run_audits, shipped_audits
-from restock.replay.store.store import Store
 
 TAGS = [{"robot": robot, "site": site} for robot, site in zip("abacd", "ooool", strict=True)]
 
@@ -34,24 +32,21 @@ def query_panel(panel: Panel, query: str) -> list[tuple[object, ...]]:
 @pytest.mark.parametrize("by", ["robot", "site"])
 def test_whole_robots_and_sites_are_held_out(fleet, by):
     held_by_seed = set()
-    with Store(fleet) as store:
-        for seed in range(3):
-            text = f"seed = {seed}\n[evaluation_split]\nby = '{by}'\n" + EVERY
-            plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
-            names = np.array(plan.rows[by].to_pylist())
-            held, kept = set(names[plan.evaluation_split]), set(names[plan.panel_rows])
-            assert held
-            assert kept
-            assert not held & kept
-            assert held | kept == {tags[by] for tags in TAGS}
-            held_by_seed |= held
+    for seed in range(3):
+        plan = planned(fleet, f"seed = {seed}\n[evaluation_split]\nby = '{by}'\n" + EVERY)
+        names = np.array(plan.rows[by].to_pylist())
+        held, kept = set(names[plan.evaluation_split]), set(names[plan.panel_rows])
+        assert held
+        assert kept
+        assert not held & kept
+        assert held | kept == {tags[by] for tags in TAGS}
+        held_by_seed |= held
     assert len(held_by_seed) > 1
 
 
 def test_robots_are_held_out_by_name(fleet):
     text = "[evaluation_split]\nby = 'robot'\nrobots = ['c', 'd']\nshare = 0\n" + EVERY
-    with Store(fleet) as store:
-        plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
+    plan = planned(fleet, text)
     robots = np.array(plan.rows["robot"].to_pylist())
     assert set(robots[plan.evaluation_split]) == {"c", "d"}
     assert set(robots[plan.panel_rows]) == {"a", "b"}
@@ -63,8 +58,8 @@ def test_robots_are_held_out_by_name(fleet):
 )
 def test_invalid_held_out_robots_are_refused(fleet, robots, message):
     text = f"[evaluation_split]\nby = 'robot'\nrobots = {robots}\n" + EVERY
-    with Store(fleet) as store, pytest.raises(MixtureError, match=message) as caught:
-        plan_panel(store.connection, parse_mixture(text), store.conditions())
+    with pytest.raises(MixtureError, match=message) as caught:
+        planned(fleet, text)
     assert caught.value.remedy
     with pytest.raises(ConfigError, match='needs by = "robot"'):
         parse_mixture(text.replace("'robot'", "'site'"))
@@ -89,8 +84,7 @@ def test_rows_of_held_out_robot_are_leak(fleet, tmp_path):
 def test_only_admitted_episodes_are_held_out(fleet, by):
     # Regression: all held-out rows were of the latest recording, which is another robot's.
     text = f"where = \"robot = 'a'\"\n[evaluation_split]\nby = '{by}'\n" + EVERY
-    with Store(fleet) as store:
-        plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
+    plan = planned(fleet, text)
     robots = np.array(plan.rows["robot"].to_pylist())
     assert set(robots[plan.evaluation_split]) == set(robots[plan.panel_rows]) == {"a"}
     if by != "recording":  # one of two recordings is half

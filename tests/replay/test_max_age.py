@@ -29,9 +29,7 @@ def test_age_is_relative_to_time_of_mixing(tmp_path):
     oldest = panel_of(rows, "max_age_days = 1e300\n" + NO_SPLIT + EVERY, tmp_path / "d")
     assert len(oldest) == len(rows)
     without = panel_of(rows, NO_SPLIT + EVERY, tmp_path / "c")
-    assert (
-        without.header.as_of_ns is None
-    )  # without an age limit a panel does not depend on the clock
+    assert without.header.as_of_ns is None  # the panel does not depend on the clock
 
 
 def test_panel_is_reproduced_with_its_as_of_time(tmp_path, monkeypatch):

@@ -153,9 +153,8 @@ def check_row(profile: Profile, row: dict[str, Any], messages: list[MessageAtTic
         assert named["pose"].stamp_ns == row["pose_stamp_ns"]
     else:
         transforms = {m.fields["child"]: m for m in messages if m.input == "pose"}
-        assert pose_of(profile, transforms) == pytest.approx(
-            [row["pose_x_m"], row["pose_y_m"]], abs=1e-5
-        )
+        position = pytest.approx([row["pose_x_m"], row["pose_y_m"]], abs=1e-5)
+        assert pose_of(profile, transforms) == position
         moving = [m.stamp_ns for m in transforms.values() if m.max_age_s is not None]
         assert max(moving) == row["pose_stamp_ns"]
     for name, signal in profile.signals.items():

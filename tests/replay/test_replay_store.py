@@ -275,9 +275,7 @@ def test_every_view_column_is_documented(store):
     } - {f"stored_{name}" for name in ("transitions", "recordings", "ingests", "frames")}
     assert views == set(view_docs())
     there = {(row["view"], row["column_name"]) for row in rows(store, "FROM columns")}
-    assert {
-        key for key in column_docs() if key[0] != "shared"
-    } <= there  # every documented column exists
+    assert {key for key in column_docs() if key[0] != "shared"} <= there
 
 
 def test_queries_are_read_only(store, tmp_path):

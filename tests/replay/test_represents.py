@@ -248,6 +248,15 @@ def test_row_cap_per_episode_keeps_natural_rates(transitions, tmp_path, shares):
     assert run == pytest.approx(of_whole["near_collision"].natural_share, rel=0.02)
 
 
+def corrected_strata(rows: list[int], timing: str) -> tuple[list[ResolvedStratum], np.ndarray]:
+    """Return fully corrected strata of so many rows each, and the stratum code of every row."""
+    strata = [
+        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, timing, "full")  # type: ignore[arg-type]
+        for i in range(len(rows))
+    ]
+    return strata, np.repeat(np.arange(len(rows)), rows).astype(np.int16)
+
+
 @given(
     st.lists(st.integers(1, 200), min_size=2, max_size=5),
     st.data(),
@@ -260,11 +269,7 @@ def test_weights_recover_natural_rates_exactly(rows, data, timing):
     parts = st.lists(st.floats(0.01, 1.0), min_size=size, max_size=size)
     rates, shares = (np.array(data.draw(parts)) for _ in range(2))
     rates, shares = rates / rates.sum(), shares / shares.sum()
-    strata = [
-        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, timing, "full")
-        for i in range(size)
-    ]
-    code = np.repeat(np.arange(size), rows).astype(np.int16)
+    strata, code = corrected_strata(rows, timing)
     state = code if timing == "pre" else np.full(len(code), -1, np.int16)
     rule = CorrectionRule(pre="full", post="full")
     weights = importance_weights(code, state, strata, shares, rule, None, rates)
@@ -280,11 +285,7 @@ def test_weights_recover_natural_rates_exactly(rows, data, timing):
 def test_natural_sample_represents_itself(rows, data):
     size = len(rows)
     shares = np.array(data.draw(st.lists(st.floats(0.1, 1), min_size=size, max_size=size)))
-    strata = [
-        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, "pre", "full")
-        for i in range(size)
-    ]
-    code = np.repeat(np.arange(size), rows).astype(np.int16)
+    strata, code = corrected_strata(rows, "pre")
     own = np.bincount(code) / len(code)
     rule, shares = CorrectionRule(), shares / shares.sum()
     assert importance_weights(code, code, strata, shares, rule, None, own) == pytest.approx(

@@ -53,13 +53,10 @@ def shipped_reward(route_m: float, steps: int, bumps: bool) -> tuple[list[float]
 def hasty_and_careful(pay: Callable[..., tuple[list[float], str]], count: int) -> list[Episode]:
     """Return missions of a careful planner, and of a faster agent that bumps in a quarter."""
     rng = np.random.default_rng(0)
-    routes_m = rng.uniform(6, 10, count).tolist()
-    careful: list[Episode] = [
-        ("planner", *pay(route_m, round(route_m * 9), False)) for route_m in routes_m
-    ]
+    lengths = rng.uniform(6, 10, count).tolist()
+    careful: list[Episode] = [("planner", *pay(m, round(m * 9), False)) for m in lengths]
     hasty: list[Episode] = [
-        ("agent", *pay(route_m, round(route_m * 6), number % 4 == 0))
-        for number, route_m in enumerate(routes_m)
+        ("agent", *pay(m, round(m * 6), number % 4 == 0)) for number, m in enumerate(lengths)
     ]
     return careful + hasty
 
@@ -182,9 +179,8 @@ def test_evaluation_is_compared_mission_by_mission(tmp_path):
     found = audited(run)
     assert found["reward_order"] == "fail"
     assert found["near_collision: operator 1 > agent 1"] == "reversed"
-    assert (
-        cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2
-    )  # the run has its own discount
+    # The run has a discount of its own.
+    assert cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2
 
 
 def ordered(

@@ -106,17 +106,18 @@ def test_rows_match_naive_n_step_oracle(num_envs, n_step, steps, seed):
     assert not expected
 
 
-def filled(
-    capacity: int = 40, steps: int = 60, seed: int = 0, n_step: int = 3
+def make_ring(
+    capacity: int = 60, seed: int = 0, num_envs: int = 2, **reserved: int
 ) -> tuple[FreshRing, Drive]:
-    """Return a ring after some steps; ended episodes are labelled by step parity."""
-    ring = FreshRing(capacity, 2, SIZE, discount=0.9, n_step=n_step, conditions=CONDITIONS)
-    drive = Drive(2, seed)
-    advance(ring, drive, steps)
-    return ring, drive
+    """Return an empty ring and its environments."""
+    ring = FreshRing(
+        capacity, num_envs, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS, reserved=reserved
+    )
+    return ring, Drive(num_envs, seed)
 
 
 def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
+    """Drive some steps; label ended episodes by the parity of their steps."""
     for _ in range(steps):
         step = drive.step()
         keys = ring.append(**step, env_step=len(drive.steps), gradient_step=0, policy_version=7)
@@ -125,7 +126,8 @@ def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
 
 
 def test_strata_follow_labels_and_eviction():
-    ring, _ = filled(capacity=30, steps=200)
+    ring, drive = make_ring(30)
+    advance(ring, drive, 200)
     ended = ~np.isin(ring.meta["episode"][: len(ring)], ring.episode_key)
     codes = ring.condition(np.arange(len(ring)))
     assert (codes[ended] >= 0).all()
@@ -148,9 +150,9 @@ def assert_alike(one: FreshRing, other: FreshRing) -> None:
 @pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
 @pytest.mark.parametrize("reserved", [{}, {"wheel_slip": 20}])
 def test_restored_ring_continues_exactly(steps, reserved):
-    ring, drive = reserving(seed=5, **reserved)
+    ring, drive = make_ring(seed=5, **reserved)
     label_rarely(ring, drive, steps)
-    other, _ = reserving(seed=5, **reserved)
+    other, _ = make_ring(seed=5, **reserved)
     other.load_state_dict(through_json(ring.state_dict()))
     for one in (ring, other):
         label_rarely(one, Drive(2, 11), 200)
@@ -173,15 +175,6 @@ def test_invalid_labels_are_refused():
             ring.set_labels(key, np.array(labels))
 
 
-def reserving(
-    capacity: int = 60, seed: int = 0, num_envs: int = 2, **reserved: int
-) -> tuple[FreshRing, Drive]:
-    ring = FreshRing(
-        capacity, num_envs, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS, reserved=reserved
-    )
-    return ring, Drive(num_envs, seed)
-
-
 def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
     """Drive some steps; label one episode in ten as wheel slip and all others as nominal."""
     for _ in range(steps):
@@ -192,9 +185,9 @@ def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
 
 
 def test_reserved_rare_rows_are_not_evicted():
-    plain, drive = reserving(seed=3)
+    plain, drive = make_ring(seed=3)
     label_rarely(plain, drive, 1500)
-    kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
+    kept, drive = make_ring(seed=3, wheel_slip=25, blocked_aisle=10)
     label_rarely(kept, drive, 1500)
     assert plain.by_condition.counts[0] < 15
     assert 25 <= kept.by_condition.counts[0] <= 60
@@ -219,19 +212,19 @@ def test_ring_with_reserves_stays_consistent(capacity, steps, parts, seed):
         name: part * capacity // max(sum(parts), 1)
         for name, part in zip(CONDITIONS, parts, strict=True)
     }
-    ring, drive = reserving(capacity, seed=seed, **reserved)
+    ring, drive = make_ring(capacity, seed=seed, **reserved)
     advance(ring, drive, steps)
-    filled = len(ring)
-    assert filled == min(ring.appended, capacity)
-    codes = ring.condition(np.arange(filled))
+    size = len(ring)
+    assert size == min(ring.appended, capacity)
+    codes = ring.condition(np.arange(size))
     for code in range(3):
         assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
     # Every row is a distinct step, unchanged since it was appended.
-    key = (ring.meta["episode"][:filled] << 20) + ring.meta["episode_step"][:filled]
-    assert len(np.unique(key)) == filled
+    key = (ring.meta["episode"][:size] << 20) + ring.meta["episode_step"][:size]
+    assert len(np.unique(key)) == size
     expected = oracle(drive.steps, 0.9, 3)
     at = {tuple(np.float32(row)): place for place, row in expected.items()}
-    for slot in range(filled):
+    for slot in range(size):
         _, first = at[tuple(ring.rows[slot])]
         assert ring.meta["env_step"][slot] == first + 1
 
@@ -239,11 +232,11 @@ def test_ring_with_reserves_stays_consistent(capacity, steps, parts, seed):
 @pytest.mark.parametrize("reserved", [{"wheel_slip": 40, "nominal": 30}, {"unheard_of": 1}])
 def test_invalid_reserves_are_refused(reserved):
     with pytest.raises(MixtureError, match="cannot be reserved"):
-        reserving(60, **reserved)
+        make_ring(60, **reserved)
 
 
 @pytest.mark.parametrize("other", [{"capacity": 61}, {"wheel_slip": 20}])
 def test_state_of_other_ring_is_refused(other):
-    ring, _ = reserving(60, wheel_slip=40)
+    ring, _ = make_ring(60, wheel_slip=40)
     with pytest.raises(MixtureError, match=r"another shape|reserved"):
-        reserving(**other)[0].load_state_dict(ring.state_dict())
+        make_ring(**other)[0].load_state_dict(ring.state_dict())

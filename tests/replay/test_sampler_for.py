@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -54,22 +55,18 @@ def td_errors(rows: np.ndarray, strata: np.ndarray) -> np.ndarray:
     return np.where((strata == 0) | (rows % 2 == 0), LARGE_TD, 0.1).astype(np.float32)
 
 
-def by_sampler(make: Callable[[Panel], LoggedSampler]) -> Way:
-    def draw(panel: Panel) -> Iterator[Drawn]:
-        sampler, number = make(panel), 0
-        while True:
-            sampler.move_to(number * 10)
-            batch = sampler.draw()
-            if len(batch.rows) < BATCH:
-                raise MixtureError("no more", remedy="mix with more")
-            packed = np.empty((BATCH, panel.rows.shape[1]), np.float32)
-            sampler.gather(batch.rows, packed)
-            np.testing.assert_array_equal(packed, panel.rows[batch.rows])
-            yield Drawn(batch.rows, batch.strata)
-            sampler.update(batch.rows, td_errors(batch.rows, batch.strata))
-            number += 1
-
-    return draw
+def by_sampler(panel: Panel) -> Iterator[Drawn]:
+    sampler = sampler_for(panel, BATCH, seed=0)
+    for number in range(10**9):
+        sampler.move_to(number * 10)
+        batch = sampler.draw()
+        if len(batch.rows) < BATCH:
+            raise MixtureError("no more", remedy="mix with more")
+        packed = np.empty((BATCH, panel.rows.shape[1]), np.float32)
+        sampler.gather(batch.rows, packed)
+        np.testing.assert_array_equal(packed, panel.rows[batch.rows])
+        yield Drawn(batch.rows, batch.strata)
+        sampler.update(batch.rows, td_errors(batch.rows, batch.strata))
 
 
 def by_batches(panel: Panel) -> Iterator[Drawn]:
@@ -84,24 +81,21 @@ def by_batches(panel: Panel) -> Iterator[Drawn]:
         batches.note_errors(batch, torch.from_numpy(td))
 
 
-def by_library(reported: bool) -> Way:
-    def draw(panel: Panel) -> Iterator[Drawn]:
-        options = FeedOptions(profile="warehouse_amr", audit_share=0.0, log_every=10)
-        feed = MixedFeed(64, 2, panel.observation_size, panel, options)
-        for _ in range(10**9):
-            batch = feed.draw_logs(BATCH)
-            yield Drawn(batch.rows, batch.strata)
-            td = td_errors(batch.rows, batch.strata) if reported else None
-            feed.drawn(panel.rows[batch.rows], batch, np.empty(0, np.int64), td=td)
-
-    return draw
+def by_library(panel: Panel, reports_td: bool = True) -> Iterator[Drawn]:
+    options = FeedOptions(profile="warehouse_amr", audit_share=0.0, log_every=10)
+    feed = MixedFeed(64, 2, panel.observation_size, panel, options)
+    for _ in range(10**9):
+        batch = feed.draw_logs(BATCH)
+        yield Drawn(batch.rows, batch.strata)
+        td = td_errors(batch.rows, batch.strata) if reports_td else None
+        feed.drawn(panel.rows[batch.rows], batch, np.empty(0, np.int64), td=td)
 
 
 WAYS: dict[str, Way] = {
-    "sampler_for": by_sampler(lambda panel: sampler_for(panel, BATCH, seed=0)),
+    "sampler_for": by_sampler,
     "training": by_batches,
-    "a library's buffer": by_library(True),
-    "a library's buffer without TD errors": by_library(False),
+    "a library's buffer": by_library,
+    "a library's buffer without TD errors": partial(by_library, reports_td=False),
 }
 
 

@@ -1,6 +1,7 @@
 """No stratum is corrected below its natural share, and missing rows are reported."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -18,10 +19,8 @@ from restock.replay.mixture.shares import missing_rows, plan_shares
 from restock.replay.places import open_place
 from restock.replay.plan.source_plan import below_natural
 from restock.replay.plan.strata import NO_STRATUM, ResolvedStratum, assign, deal_episodes
-from restock.replay.store.audit import load_audits, load_thresholds, run_audits
+from restock.replay.store.audit import Finding, load_audits, load_thresholds, run_audits
 
-AUDITS = {audit.name: audit for audit in load_audits()}
-THRESHOLDS = load_thresholds()
 EQUAL = "planned_draws = 6400\n[each_condition]\nshare = 'equal'\n"
 
 
@@ -160,31 +159,29 @@ def test_plan_shows_four_shares_and_missing_rows(store_path, tmp_path, shell):
     for line in short:
         assert line["note"]
     text = shell.out(*arguments)
-    for name in (
-        "natural: %",
-        "wanted: %",
-        "drawn: % of",
-        "% of their",
-    ):  # their units
+    for name in ("natural: %", "wanted: %", "drawn: % of", "% of their"):
         assert name in text
     assert "% wanted" not in text  # only the table has this number
     assert f"{short[0]['missing_rows']:,} more rows would fill it" in text
+
+
+def finding_on(store: Path, name: str, **places: Path) -> Finding:
+    """Return an audit's finding on a panel or a run of the store."""
+    (audit,) = [audit for audit in load_audits() if audit.name == name]
+    with open_place(store, beside=places) as connection:
+        return run_audits(connection, [audit], {name: load_thresholds()[name]}, beside=[*places])[0]
 
 
 def test_audit_finds_weights_that_undo_quota(store_path, tmp_path):
     allow = EQUAL + "[correction]\npost = '{}'\nbelow_natural = 'allow'\n"
     for post, status in (("full", "fail"), ("none", "pass")):
         panel = panel_of(store_path, allow.format(post), tmp_path / post)
-        name = "panel_effective_share"
-        with open_place(store_path, beside={"panel": panel.path}) as connection:
-            found = run_audits(
-                connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["panel"]
-            )
-        assert found[0].status == status
+        finding = finding_on(store_path, "panel_effective_share", panel=panel.path)
+        assert finding.status == status
         below = [line.name for line in panel.strata if below_natural(line)]
-        assert {row["stratum"] for row in found[0].sample} == set(below)
+        assert {row["stratum"] for row in finding.sample} == set(below)
 
-    run, name = tmp_path / "run", "effective_share"
+    run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text("{}")
     lines = [  # stratum, natural share, drawn rows, effective share; the same in two intervals
@@ -211,15 +208,14 @@ def test_audit_finds_weights_that_undo_quota(store_path, tmp_path):
         for step in (100, 200)
     ]
     pq.write_table(pa.Table.from_pylist(rows), run / "fed.parquet")
-    with open_place(store_path, beside={"run": run}) as connection:
-        found = run_audits(connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["run"])
-    starved, row = found[0].sample  # short in the batch, then reduced by weights
+    finding = finding_on(store_path, "effective_share", run=run)
+    starved, row = finding.sample  # short in the batch, then reduced by weights
     assert (starved["stratum"], starved["source"], starved["reason"]) == (
         "recovery",
         "batch",
         "few",
     )
     assert (starved["wanted_share"], starved["drawn_share"]) == pytest.approx((0.4, 0.05))
-    assert (found[0].status, row["stratum"]) == ("fail", "wheel_slip")
+    assert (finding.status, row["stratum"]) == ("fail", "wheel_slip")
     assert row["drawn_share"] == pytest.approx(0.3)
     assert row["effective_share"] == pytest.approx(0.01)
