@@ -108,7 +108,7 @@ def test_batches_meet_quotas(tmp_path: Path) -> None:
         assert name == "rare" or (drawn[:, 1] > 0.5).all()
 
 
-def edited(number: int, **values: Any) -> Callable[[], pa.Table]:
+def edit(number: int, **values: Any) -> Callable[[], pa.Table]:
     rows = [*ROWS]
     rows[number] = {**rows[number], **values}
     return lambda: table(rows, "after")
@@ -124,16 +124,13 @@ HALVES = [{**row, "action": row["action"] / 2} for row in ROWS]
         (lambda: table(ROWS, "terminated", "truncated"), "it has no terminated, truncated"),
         (lambda: table(ROWS, "condition"), "it has no condition"),
         (lambda: table(OPEN, "after"), "no row ends an episode"),
-        (edited(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
-        (
-            edited(0, next_observation=[1.0]),
-            "next observation of row 0 does not have 4 entries",
-        ),
-        (edited(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
+        (edit(7, observation=[1.0, 2.0]), "row 7 has 2 entries, that of row 0 4"),
+        (edit(0, next_observation=[1.0]), "next observation of row 0 does not have 4 entries"),
+        (edit(3, reward=None), "row 3 lacks its observation, reward, end or episode"),
         (lambda: table(HALVES, "after"), "is not a whole number from 0 to 32,767"),
-        (edited(5, action=-1), "the action of row 5 is not a whole number"),
-        (edited(4, truncated=True), "row 5 follows the end of its episode"),
-        (edited(6, condition=None), "1 rows have no coverage label"),
+        (edit(5, action=-1), "the action of row 5 is not a whole number"),
+        (edit(4, truncated=True), "row 5 follows the end of its episode"),
+        (edit(6, condition=None), "1 rows have no coverage label"),
         (lambda: table([{**row, "condition": 1} for row in ROWS]), "condition must be text"),
         (
             lambda: table([{**row, "condition": "nominal"} for row in ROWS]),

@@ -251,7 +251,7 @@ def test_row_cap_per_episode_keeps_natural_rates(transitions, tmp_path, shares):
 def corrected_strata(rows: list[int], timing: str) -> tuple[list[ResolvedStratum], np.ndarray]:
     """Return fully corrected strata of so many rows each, and the stratum code of every row."""
     strata = [
-        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, timing, "full")  # type: ignore[arg-type]
+        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, timing, "full")
         for i in range(len(rows))
     ]
     return strata, np.repeat(np.arange(len(rows)), rows).astype(np.int16)
