@@ -152,7 +152,7 @@ def test_charts_are_valid_vega_lite(html: str) -> None:
 
 
 def test_page_is_offline_and_escapes_names(html: str) -> None:
-    assert Page(html).tags.count("script") == 3  # rows, Vega, and what draws with it
+    assert Page(html).tags.count("script") == 3  # rows, Vega, and the script that draws
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text
 

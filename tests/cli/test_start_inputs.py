@@ -84,7 +84,7 @@ def test_custom_urdf_and_map_reach_report(tmp_path, shell):
     Image.fromarray(np.pad(np.full((80, 300), 254, np.uint8), 2)).save(tmp_path / "hall.pgm")
     hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [-1.0, -1.0, 0]\n")
     topics = typed_topics(Drive(20.0))
-    topics["/scan"][1].fields["ranges"].values[:] = np.inf  # returns would not lie on its walls
+    topics["/scan"][1].fields["ranges"].values[:] = np.inf  # returns would contradict the map
     bag = write_topics(topics, tmp_path / "bag")
     argv = (bag, "--out", out, "--urdf", urdf, "--map", hall)
     document = shell.json("start", *argv, "--minutes", "0.1")
@@ -218,7 +218,7 @@ def test_robot_without_lidar_has_no_blocked_aisles(tmp_path, lidar):
     requested = StartCommand(("bag",), tmp_path / "out", profile=str(profile), twin="yes")
     way = Way(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
     assert way._twin() is not None
-    assert way.to.kinds == (() if lidar else tuple(driven))  # none: all
+    assert way.to.kinds == (() if lidar else tuple(driven))  # empty: every kind
     conditions = [one for one in way.to.train if one.startswith("env.conditions")]
     assert bool(conditions) is not lidar
     assert not any("blocked_aisle" in one for one in conditions)
@@ -236,9 +236,9 @@ def test_few_rows_leave_draws_for_twin() -> None:
     allowed = 267 * 400 / 128  # updates
     settings = dict(one.split("=") for one in updates_settings(few, 1.0, twin=True, seconds=30.0))
     assert int(settings["schedule.offline_updates"]) == int(allowed / 2)
-    assert int(settings["schedule.env_steps"]) == 15_000  # what 30 s drive, not the usual 200,000
+    assert int(settings["schedule.env_steps"]) == 15_000  # what 30 s allow, not 200,000
     many = {"rows": 12_000, "max_replays_per_row": 400.0}
     assert updates_settings(many, 1.0, twin=True, seconds=30.0) == []
-    # On the logs alone nothing is driven, and all draws are for them.
+    # Without the twin, all draws are for offline updates.
     (alone, _) = updates_settings(few, 9.0, twin=False)
     assert alone == f"schedule.offline_updates={int(allowed)}"

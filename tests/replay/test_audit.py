@@ -37,7 +37,7 @@ from restock.replay.store.store import Store
 
 AUDITS = {audit.name: audit for audit in shipped_audits()}
 Tables = tuple[pa.Table, pa.Table]  # transitions, recordings
-TABLE = re.compile(r"\b(FROM|INTO|UPDATE) (transitions|recordings)\b")  # named by a fault
+TABLE = re.compile(r"\b(FROM|INTO|UPDATE) (transitions|recordings)\b")  # changed by a fault
 
 
 @pytest.fixture(scope="module")
@@ -364,7 +364,7 @@ def test_invalid_audit_arguments_exit_2(store_path, panels, tmp_path, shell):
     (tmp_path / "file").touch()
     for place, words, named in (
         (tmp_path, [], tmp_path),  # no store
-        (lost, [], lost),  # without a row, which passes no gate
+        (lost, [], lost),  # without rows
         (lost, ["--reward"], lost),
         (store_path, [panels["time"], panels["time"]], panels["time"]),  # two panels
         (store_path, ["--junit", tmp_path / "file" / "x.xml"], tmp_path / "file"),

@@ -102,7 +102,7 @@ def test_density_ratio_keeps_risky_states_boosted():
     assert weighted["full"][risky].sum() == pytest.approx(natural, rel=0.01)
     assert weighted["density_ratio"][risky].sum() == pytest.approx(drawn[risky].sum(), rel=0.05)
     assert drawn[risky].sum() > 2.5 * natural
-    # Its effective count is between those of full and of no correction.
+    # The effective count is between those of full and of no correction.
     effective = {name: effective_count(weights) for name, weights in weighted.items()}
     assert effective["full"] == pytest.approx(COUNT, rel=1e-3)
     assert effective["none"] < effective["density_ratio"] < effective["full"]

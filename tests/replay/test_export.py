@@ -75,7 +75,7 @@ def test_tags_are_exported(tmp_path):
     export_dataset(panel.path, "parquet", tmp_path / "b.parquet")
     robots = pq.read_table(tmp_path / "b.parquet")["robot"].to_pylist()
     assert robots.count("amr-07") == len(tables[0])
-    # The export of a query without these columns lacks them.
+    # A query without these columns is exported without them.
     plain = "SELECT * EXCLUDE (robot, site, recording_id) FROM transitions"
     out = tmp_path / "c.parquet"
     assert export_dataset(store, "parquet", out, query=plain)["provenance"]["tags"] == {}
@@ -93,7 +93,7 @@ def test_rows_left_out_by_query_cut_episodes(store_path, transitions):
     assert counts.cut > 0
     for t in found:
         ids = t.carried["transition_id"].tolist()
-        assert ids == list(range(ids[0], ids[0] + len(t)))  # steps on end
+        assert ids == list(range(ids[0], ids[0] + len(t)))  # consecutive steps
         np.testing.assert_array_equal(t.observations[-1], slipping[ids[-1]]["next_observation"])
         last = slipping[ids[-1]]
         assert t.terminated == last["terminated"]

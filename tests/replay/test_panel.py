@@ -328,7 +328,7 @@ def test_panel_rows_are_read_only(transitions, tmp_path):
 
 MEASURED = """
 import resource, sys
-import scipy.optimize, scipy.special  # imported by the ratio's fit: libraries are not data
+import scipy.optimize, scipy.special  # before the limit, which is for data
 from pathlib import Path
 from restock.replay.panel.build import build_panel
 from restock.replay.mixture.mixture import parse_mixture

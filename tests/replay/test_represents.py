@@ -120,10 +120,10 @@ def test_main_store_can_be_archive(folder):
     ("mine", "theirs", "refused", "warned"),
     [
         ((25, 65), (21, 182), False, True),  # 3.3 times as frequent, odds 4.7 times
-        ((36, 40), (80, 200), True, True),  # what two fifths meet is at most 2.5 times as frequent
-        ((3, 6), (21, 182), False, False),  # a small one, by chance
+        ((36, 40), (80, 200), True, True),  # a share of 40 % can rise 2.5-fold at most
+        ((3, 6), (21, 182), False, False),  # few episodes, so by chance
         ((30, 100), (50, 182), False, False),
-        ((180, 1000), (100, 1000), False, False),  # surely more, and less than twice
+        ((180, 1000), (100, 1000), False, False),  # significantly more, but less than twice
         ((0, 0), (21, 182), False, False),  # without episodes
     ],
 )

@@ -137,7 +137,7 @@ def test_mixture_rules_hold_or_draw_is_refused(panels, name, way):
         assert "depend on TD errors" in refusal
         assert len(batches) <= 1
         return
-    # With a limit the rows end; without one they do not.
+    # Draws end if there is a limit, and only then.
     if limit is not None:
         assert counted.max() <= limit
         assert refusal

@@ -100,7 +100,7 @@ def test_versions_of_store_by_number_and_time(tmp_path, shell):
         Store(tmp_path / "store", version=parse_version("2001-01-01"))
     with pytest.raises(StoreError, match=f"its newest is {newest}"):
         Store(tmp_path / "store", version=99)
-    with Store(tmp_path / "store", version=datetime(2999, 1, 1)) as store:  # of UTC
+    with Store(tmp_path / "store", version=datetime(2999, 1, 1)) as store:  # taken as UTC
         assert store.version == newest
     with pytest.raises(ArgumentError, match="version must be an int or datetime, got 'newest'"):
         Store(tmp_path / "store", version="newest")  # type: ignore[arg-type]

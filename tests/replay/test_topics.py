@@ -128,7 +128,7 @@ def test_folder_is_union_with_file_column(tmp_path, shell):
     assert shell.json("sql", f"{tmp_path}/a*", query) == [{"file": files[0], "n": 3}]
     query = "SELECT DISTINCT file FROM topics ORDER BY ALL"
     assert [row["file"] for row in shell.json("sql", tmp_path, query)] == files
-    assert "Did you mean" not in shell.err("sql", tmp_path, "FROM stord_odom")  # internal
+    assert "Did you mean" not in shell.err("sql", tmp_path, "FROM stord_odom")  # an internal table
 
 
 def test_lost_data_is_reported_and_rest_returned(tmp_path, shell):
