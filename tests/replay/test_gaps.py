@@ -117,7 +117,7 @@ def test_unknown_names_suggest_nearest(given, near, store):
         find_gaps(opened, parse_mixture(ASKING), name="mine", **given)
 
 
-def test_condition_that_is_never_primary(tmp_path):
+def test_condition_without_primary_rows_has_no_audit_gap(tmp_path):
     rows = recording_transitions(0)
     rarer = {"wheel_slip": "blocked_aisle"}
     named = [rarer.get(name, name) for name in rows["condition"].to_pylist()]

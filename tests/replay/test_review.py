@@ -118,7 +118,7 @@ def test_review_file_has_commands_that_open_events(monday, tmp_path, shell):
     assert "may contain verdicts" in shell.err("review", monday, "--out", file)
 
 
-def test_review_without_events(tmp_path, shell):
+def test_review_without_events_is_reported(tmp_path, shell):
     rows = recording_transitions(1, episodes=2)
     nothing = {"condition": "nominal", "conditions": [], "probabilities": []}
     rows = replaced(rows, {name: [value] * len(rows) for name, value in nothing.items()})

@@ -63,7 +63,7 @@ def test_diff_lists_added_removed_relabelled(tmp_path):
     assert {row["of"] for row in found["shares"]} >= {"primary_condition", "zone"}
 
 
-def test_unchanged_reingest_is_no_difference(tmp_path):
+def test_unchanged_reingest_gives_empty_diff(tmp_path):
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, ingest="b")])
     found = differences(first, second)
