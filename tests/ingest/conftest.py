@@ -1,4 +1,4 @@
-"""Fixtures that several of ingest's tests share."""
+"""Fixtures shared by the tests of ingest."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,24 +13,24 @@ from restock.ingest.store.writer import StoreWriter
 
 @pytest.fixture
 def writer(tmp_path: Path) -> StoreWriter:
-    """Return the writer of a store `s` of two recordings."""
-    made = StoreWriter(tmp_path / "s")
-    made.write_all([one(1), one(2)])
-    return made
+    """Return the writer of a store `s` that holds two recordings."""
+    store_writer = StoreWriter(tmp_path / "s")
+    store_writer.write_all([one(1), one(2)])
+    return store_writer
 
 
 @pytest.fixture
 def before_commit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Return a function: it has another writer do something right before the next commit."""
+    """Return a function that runs another writer's action right before the next commit."""
     transact = StoreWriter.transact
 
     def arrange(meanwhile: Callable[[], object], table: str = "") -> None:
-        def overtaken(self: StoreWriter, to: DeltaTable, *args: Any) -> None:
-            if to.table_uri.rstrip("/").endswith(table):
+        def transact_late(self: StoreWriter, delta_table: DeltaTable, *args: Any) -> None:
+            if delta_table.table_uri.rstrip("/").endswith(table):
                 monkeypatch.setattr(StoreWriter, "transact", transact)
                 meanwhile()
-            transact(self, to, *args)
+            transact(self, delta_table, *args)
 
-        monkeypatch.setattr(StoreWriter, "transact", overtaken)
+        monkeypatch.setattr(StoreWriter, "transact", transact_late)
 
     return arrange

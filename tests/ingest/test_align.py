@@ -1,4 +1,4 @@
-"""One clock, causal holds with maximum ages, and clocks that jump."""
+"""Alignment of topics on one clock: causal holds, maximum ages and clock jumps."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +23,7 @@ stamps = st.lists(st.integers(0, 10_000), max_size=30).map(sorted)
 
 
 @given(stamps, stamps, st.one_of(st.none(), st.integers(0, 3000)))
-def test_a_hold_takes_the_latest_sample_at_or_before_the_tick(samples, ticks, max_age_ns):
+def test_hold_takes_latest_sample_at_or_before_tick(samples, ticks, max_age_ns):
     held = Samples(np.array(samples, np.int64), np.arange(len(samples))).hold(
         np.array(ticks, np.int64), None if max_age_ns is None else max_age_ns / NS
     )
@@ -37,12 +37,12 @@ def test_a_hold_takes_the_latest_sample_at_or_before_the_tick(samples, ticks, ma
             assert held.fresh[index] == in_time
 
 
-def test_topics_without_a_header_are_put_on_the_header_clock():
+def test_headerless_topics_are_mapped_to_header_clock():
     sim_offset = 1_701_217_691_789_000_000
     time = np.arange(0, 5, 0.1)
     stamp = np.rint(time * 1e9).astype(np.int64)
     scan = TopicColumns(stamp + sim_offset, stamp + sim_offset, {"header.stamp": stamp})
-    late = 30_000_000  # a topic that is always 30 ms late does not set the offset
+    late = 30_000_000  # a topic that is always 30 ms late must not set the offset
     pose = TopicColumns(stamp + sim_offset + late, stamp, {"header.stamp": stamp})
     command = TopicColumns(stamp + sim_offset + 7, stamp, {})
     segments, report = align({"/scan": scan, "/pose": pose, "/cmd": command}, Clock())
@@ -61,7 +61,7 @@ def test_unordered_log_times_are_sorted():
     assert samples.hold(np.array([25]), None).row.tolist() == [3]
 
 
-def test_no_hold_crosses_a_clock_that_jumps_back():
+def test_holds_do_not_cross_backward_clock_jumps():
     log = START_NS + np.arange(100, dtype=np.int64) * NS // 10
     stamp = np.concatenate([np.arange(50), np.arange(50)]).astype(np.int64) * NS // 10
     odom = TopicColumns(log, log, {"header.stamp": stamp})
@@ -73,13 +73,14 @@ def test_no_hold_crosses_a_clock_that_jumps_back():
     assert [len(s.topics["/odom"].row) for s in segments] == [50, 50]
     first_tick = segments[1].topics["/odom"].stamp_ns[:1]
     assert first_tick.tolist() == [0]
-    assert not segments[1].topics["/slow"].hold(first_tick, None).known[0]  # not the old one's
-    assert segments[1].topics["/goal"].hold(first_tick, None).known[0]  # latched: still holds
-    # Headerless topics are mapped by their own segment's offset.
+    # the earlier segment's sample is not held
+    assert not segments[1].topics["/slow"].hold(first_tick, None).known[0]
+    assert segments[1].topics["/goal"].hold(first_tick, None).known[0]  # latched, so still held
+    # Headerless topics use the clock offset of their own segment.
     assert segments[1].clock_map.offset_ns - segments[0].clock_map.offset_ns == 5 * NS
 
 
-def test_one_bad_stamp_is_left_out_and_counted_and_is_no_jump():
+def test_single_bad_stamp_is_dropped_and_is_not_a_jump():
     time = np.arange(0, 5, 0.1)
     topic = columns(time, {})
     topic.fields["header.stamp"][20] = 0
@@ -88,7 +89,7 @@ def test_one_bad_stamp_is_left_out_and_counted_and_is_no_jump():
     assert 20 not in segments[0].topics["/odom"].row
 
 
-def test_old_latched_messages_are_put_at_log_time():
+def test_old_latched_messages_get_their_log_time():
     odom, goal = columns(np.arange(0, 5, 0.1), {}), columns(np.array([0.0]), {})
     goal.fields["header.stamp"][0] -= 600 * NS
     segments, report = align({"/odom": odom, "/goal": goal}, Clock(), frozenset({"/goal"}))
@@ -96,41 +97,41 @@ def test_old_latched_messages_are_put_at_log_time():
     assert segments[0].topics["/goal"].stamp_ns.tolist() == [START_NS]
 
 
-def test_no_header_at_all_asks_for_the_log_time():
+def test_recording_without_headers_suggests_log_time():
     time = np.array([1, 2], np.int64)
     with pytest.raises(RecordingError, match='alignment = "log_time"'):
         align({"/cmd": TopicColumns(time, time, {})}, Clock())
 
 
-def test_ticks_at_a_fixed_rate_start_at_the_first_command():
+def test_fixed_rate_ticks_start_at_first_command():
     command = Samples(np.array([5, 6], np.int64) * NS, np.arange(2))
     ticks, between = ticks_of(command, Clock(steps="rate"), 0.5, 7 * NS)
     assert (ticks / NS).tolist() == [5, 5.5, 6, 6.5, 7]
     assert between == 0
 
 
-def test_ticks_at_commands_keep_their_distance():
+def test_command_ticks_keep_minimum_interval():
     command = Samples(np.array([0, 10, 151, 200, 310], np.int64) * 10**6, np.arange(5))
     ticks, between = ticks_of(command, Clock(steps="command"), 0.2, 0)
     assert (ticks // 10**6).tolist() == [0, 151, 310]
     assert between == 2
 
 
-# -- log times that do not go on ------------------------------------------------------------------
+# -- faulty log times ------------------------------------------------------------------------------
 
 
 def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str, Any]:
-    """Return a drive's typed topics with log times `log_time_ns(time, place in the topic)`."""
-    found = {}
+    """Return the drive's typed topics with log times `log_time_ns(time, index in the topic)`."""
+    typed = {}
     for name, (kind, topic) in typed_topics(drive).items():
         times = enumerate(topic.log_time_ns.tolist())
-        log = np.array([log_time_ns(time, place) for place, time in times], np.int64)
-        found[name] = kind, TopicColumns(log, log, topic.fields)
-    return found
+        log = np.array([log_time_ns(time, index) for index, time in times], np.int64)
+        typed[name] = kind, TopicColumns(log, log, topic.fields)
+    return typed
 
 
-def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, shell):
-    topics = logged_at(Drive(8.0), lambda time, place: 0 if place % 40 == 1 else time)
+def test_messages_logged_at_zero_are_dropped_and_counted(tmp_path, shell):
+    topics = logged_at(Drive(8.0), lambda time, index: 0 if index % 40 == 1 else time)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     (row,) = shell.json("ingest", bag, "--dry-run", code=3)["recordings"]
     assert row["transitions"] > 25
@@ -150,22 +151,22 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, shell):
     assert out.exists()
 
 
-def test_stamps_that_a_driver_left_at_zero_are_named(tmp_path, shell):
+def test_zero_header_stamps_are_reported_per_topic(tmp_path, shell):
     topics = typed_topics(Drive(4.0))
     for name in ("/odom", "/imu"):
         topics[name][1].fields[STAMP][:] = 0
     bag = write_topics(topics, tmp_path / "bag")
-    said = shell.err("ingest", bag, "--dry-run")
+    stderr = shell.err("ingest", bag, "--dry-run")
     for name in ("/odom", "/imu"):
-        assert f"200 of 200 messages of {name} were left out: their header stamps do not" in said
-    assert 'set [clock] alignment = "log_time" in the profile' in said
+        assert f"200 of 200 messages of {name} were left out: their header stamps do not" in stderr
+    assert 'set [clock] alignment = "log_time" in the profile' in stderr
     assert "200 of 200 messages of /imu were left out" in shell.err(
         "profile", "check", "warehouse_amr", bag
     )
 
 
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
-def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, shell):
+def test_identical_log_times_are_rejected(alignment, tmp_path, shell):
     topics = logged_at(Drive(4.0), lambda time, place: 0)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     profile = msgspec.structs.replace(

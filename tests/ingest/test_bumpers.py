@@ -1,4 +1,4 @@
-"""Bumpers of common types, with several fields, bits or detections: pressed if any of them is."""
+"""Bumpers of common message types: fields, bits or detections, pressed if any of them is."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +16,7 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.signal_paths import pressed_in
 
 SECONDS = 6.0
-PRESSED = (2.0, 2.5)  # from, to before
+PRESSED = (2.0, 2.5)  # start and end in seconds, end exclusive
 DEFINITIONS = {
     "create_msgs/msg/Bumper": "std_msgs/Header header\nbool is_left_pressed\n"
     "bool is_right_pressed\nbool is_light_left\n",
@@ -29,7 +29,7 @@ DEFINITIONS = {
 
 
 @pytest.fixture(autouse=True)
-def _types(monkeypatch: pytest.MonkeyPatch) -> None:
+def _register_types(monkeypatch: pytest.MonkeyPatch) -> None:
     types = driven_robot._humble()
     for name, text in DEFINITIONS.items():
         if name not in types.types:
@@ -38,12 +38,12 @@ def _types(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def bumper(kind: str) -> tuple[str, Any]:
-    """Messages of this type: pressed from 2 s to 3 s, and other things at other times."""
+    """Return messages of this type, pressed during PRESSED only, with unrelated values besides."""
     name = next(one for one in DEFINITIONS if one.endswith(f"/{kind}"))
     tenth = np.arange(0, SECONDS, 0.1) + 0.001
     pressed = (tenth >= PRESSED[0]) & (tenth < PRESSED[1])
     if kind == "Bumper":
-        late = tenth > sum(PRESSED) / 2  # first the one side, then the other
+        late = tenth > sum(PRESSED) / 2  # first one side, then the other
         light = np.ones(len(tenth), np.bool_)
         fields: dict[str, Any] = {
             "is_left_pressed": pressed & ~late,
@@ -57,13 +57,13 @@ def bumper(kind: str) -> tuple[str, Any]:
     if kind == "BumperEvent":
         fields = {"bumper": np.full(2, 1, np.uint8), "state": np.array([1, 0], np.uint8)}
         return name, columns(np.array(PRESSED) + 0.001, fields, stamped=False)
-    first = np.full(len(tenth), 2, np.uint8)  # a cliff, all the time
+    first = np.full(len(tenth), 2, np.uint8)  # a cliff in every message
     second = np.where(pressed, 1, 5).astype(np.uint8)
     return name, columns(tenth, {"detections[].type": ragged([first, second])})
 
 
 @pytest.mark.parametrize("kind", ["Bumper", "HazardDetectionVector", "SensorState", "BumperEvent"])
-def test_a_bumper_of_a_known_type_is_proposed_and_read(kind, tmp_path, capsys):
+def test_known_bumper_types_are_proposed_and_read(kind, tmp_path, capsys):
     topics = typed_topics(Drive(SECONDS))
     del topics["/bumper"]
     bag = write_topics(topics | {"/touch": bumper(kind)}, tmp_path / "bag", storage="mcap")
@@ -73,15 +73,15 @@ def test_a_bumper_of_a_known_type_is_proposed_and_read(kind, tmp_path, capsys):
     assert profile.task.bump_terminates
     steps = steps_in(bag, profile)
     time_s = (steps.signals["stamp_ns"] - driven_robot.START_NS) * 1e-9
-    due = (time_s >= PRESSED[0] + 0.01) & (time_s < PRESSED[1] + 0.01)
-    apart = np.flatnonzero(steps.signals["bumped"] != due)
-    assert due.sum() in (2, 3)
-    assert len(apart) <= 1  # at the end: pressed since the tick before
+    expected = (time_s >= PRESSED[0] + 0.01) & (time_s < PRESSED[1] + 0.01)
+    differing = np.flatnonzero(steps.signals["bumped"] != expected)
+    assert expected.sum() in (2, 3)
+    assert len(differing) <= 1  # at the end: a press since the previous tick counts
     assert not [problem for problem in steps.problem if problem.startswith("bumper")]
     assert "inputs.bumper" not in capsys.readouterr().err
 
 
-def test_a_running_robot_reads_the_same() -> None:
+def test_live_observer_reads_bumper_detections() -> None:
     topic, pressed = "/hazard_detection", "detections[type=1].type"
     text = WAREHOUSE.replace('topic = "/bumper"', f'topic = "{topic}"')
     text = text.replace('pressed = "data"', f'pressed = "{pressed}"')

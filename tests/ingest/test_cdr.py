@@ -1,4 +1,4 @@
-"""The columnar decoder gives what rosbags gives, for any definition, in either byte order."""
+"""The columnar decoder agrees with rosbags for any definition and byte order."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ REPEATS = ["", "", "", "[]", "[]", "[<=5]", "[3]", "[1]"]
 
 
 def batch(payloads: list[bytes], lead: int = 3) -> MessageBatch:
-    """Payloads at odd places of one buffer, as in a chunk."""
+    """Return a batch of payloads at odd offsets of one buffer, as in a chunk."""
     padded = [b"\xaa" * lead + payload for payload in payloads]
     whole = MessageBatch.of(padded, np.arange(len(payloads)), np.arange(len(payloads)))
     return MessageBatch(
@@ -30,18 +30,20 @@ def batch(payloads: list[bytes], lead: int = 3) -> MessageBatch:
     )
 
 
-def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> None:
+def assert_agrees_with_rosbags(
+    message: RosType, payloads: list[bytes], *, ros1: bool = False
+) -> None:
     leaves = message.leaves()
-    given_batch = batch(payloads)
-    columnar = ColumnDecoder(message, leaves, ros1=ros1).decode(given_batch)
-    rosbags = RowDecoder(message, leaves, ros1=ros1).decode(given_batch)
+    messages = batch(payloads)
+    columnar = ColumnDecoder(message, leaves, ros1=ros1).decode(messages)
+    rosbags = RowDecoder(message, leaves, ros1=ros1).decode(messages)
     assert columnar.bad == rosbags.bad == {}
     assert np.array_equal(columnar.rows, rosbags.rows)
     assert columnar.fields.keys() == rosbags.fields.keys()
     for path, column in rosbags.fields.items():
         assert equal(columnar.fields[path], column), path
-    for leaf in leaves:  # and each on its own, so that the others are stepped over
-        alone = ColumnDecoder(message, [leaf], ros1=ros1).decode(given_batch)
+    for leaf in leaves:  # each leaf alone, so that the others are skipped over
+        alone = ColumnDecoder(message, [leaf], ros1=ros1).decode(messages)
         assert equal(alone.fields[leaf.path], rosbags.fields[leaf.path]), leaf.path
 
 
@@ -50,8 +52,8 @@ def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> Non
 
 @st.composite
 def definitions(draw: st.DrawFn, *, ros1: bool = False) -> str:
-    """Return a message definition with the messages it is made of, as a recording carries it."""
-    bounds = "[]" if ros1 else "[<=5]"  # ROS 1 knows none
+    """Return a message definition with its nested definitions, as a recording carries it."""
+    bounds = "[]" if ros1 else "[<=5]"  # ROS 1 has no bounded arrays
     repeats = [bounds if repeat == "[<=5]" else repeat for repeat in REPEATS]
     others = ["time", "duration"] if ros1 else ["string<=8", "builtin_interfaces/Time"]
     count = draw(st.integers(1, 4))
@@ -70,8 +72,8 @@ def definitions(draw: st.DrawFn, *, ros1: bool = False) -> str:
     return rule.join([texts[0], *family, *([] if ros1 else [f"builtin_interfaces/Time\n{time}"])])
 
 
-class Maker:
-    """Random messages of a definition: varied lengths, or all alike."""
+class MessageGenerator:
+    """Generator of random messages of a definition, with varied lengths."""
 
     def __init__(self, store: Any, rng: np.random.Generator, longest: int) -> None:
         self.store, self.rng, self.longest = store, rng, longest
@@ -117,18 +119,19 @@ class Maker:
     little=st.booleans(),
     alike=st.booleans(),
 )
-def test_any_definition_decodes_as_rosbags_does(text, seed, rows, longest, little, alike):
+def test_random_definition_decodes_like_rosbags(text, seed, rows, longest, little, alike):
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, "pkg/msg/T0"))
     message = message_type(
         Channel(1, "/t", "pkg/msg/T0", "cdr", "ros2msg", text.encode()), "humble"
     )
-    maker = Maker(store, np.random.default_rng(seed), longest)
-    made = [maker.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
+    generator = MessageGenerator(store, np.random.default_rng(seed), longest)
+    generated = [generator.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
     payloads = [
-        bytes(store.serialize_cdr(one, "pkg/msg/T0", little_endian=little)) for one in made
+        bytes(store.serialize_cdr(message_, "pkg/msg/T0", little_endian=little))
+        for message_ in generated
     ] * (rows if alike else 1)
-    agree(message, payloads)
+    assert_agrees_with_rosbags(message, payloads)
 
 
 @settings(max_examples=100, suppress_health_check=list(HealthCheck))
@@ -139,17 +142,19 @@ def test_any_definition_decodes_as_rosbags_does(text, seed, rows, longest, littl
     longest=st.sampled_from([0, 1, 3, 9]),
     alike=st.booleans(),
 )
-def test_any_ros1_definition_decodes_as_rosbags_does(text, seed, rows, longest, alike):
+def test_random_ros1_definition_decodes_like_rosbags(text, seed, rows, longest, alike):
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(text, "pkg/msg/T0"))
     channel = Channel(1, "/t", "pkg/T0", "ros1", "ros1msg", text.encode())
-    maker = Maker(store, np.random.default_rng(seed), longest)
-    made = [maker.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
-    payloads = [bytes(store.serialize_ros1(one, "pkg/msg/T0")) for one in made]
-    agree(message_type(channel, "humble"), payloads * (rows if alike else 1), ros1=True)
+    generator = MessageGenerator(store, np.random.default_rng(seed), longest)
+    generated = [generator.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
+    payloads = [bytes(store.serialize_ros1(message_, "pkg/msg/T0")) for message_ in generated]
+    assert_agrees_with_rosbags(
+        message_type(channel, "humble"), payloads * (rows if alike else 1), ros1=True
+    )
 
 
-def test_both_byte_orders_in_one_batch():
+def test_batch_with_both_byte_orders():
     message = message_type(Channel(1, "/t", "nav_msgs/msg/Path", "cdr"), "humble")
     types = STORE.types
     payloads = []
@@ -164,19 +169,19 @@ def test_both_byte_orders_in_one_batch():
         path = types["nav_msgs/msg/Path"](header, poses)
         little = row % 2 == 0
         payloads.append(bytes(STORE.serialize_cdr(path, "nav_msgs/msg/Path", little_endian=little)))
-    agree(message, payloads)
+    assert_agrees_with_rosbags(message, payloads)
 
 
 # -- golden bytes ---------------------------------------------------------------------------
 
 
-def one(kind: str, definition: str = "") -> RosType:
+def ros_type(kind: str, definition: str = "") -> RosType:
     form = "ros2msg" if definition else ""
     return message_type(Channel(1, "/t", kind, "cdr", form, definition.encode()), "humble")
 
 
-def test_xcdr2_and_parameter_lists_are_refused_by_name():
-    message = one("std_msgs/msg/Bool")
+def test_xcdr2_and_parameter_lists_are_rejected():
+    message = ros_type("std_msgs/msg/Bool")
     good, xcdr2 = bytes.fromhex("0001000001"), bytes.fromhex("0007000001")
     decoded = ColumnDecoder(message, message.leaves()).decode(
         batch([good, xcdr2, xcdr2, b"\0\3\0\0"])
@@ -188,8 +193,8 @@ def test_xcdr2_and_parameter_lists_are_refused_by_name():
     }
 
 
-def test_mis_sized_messages_are_counted_and_the_others_kept():
-    message = one("std_msgs/msg/String")
+def test_missized_messages_are_counted_and_others_kept():
+    message = ros_type("std_msgs/msg/String")
     rows = [bytes(STORE.serialize_cdr(STORE.types[message.name](t), message.name)) for t in "abc"]
     rows[1:1] = [rows[0][:-1], rows[0] + b"\0\0\0\0", b"\0\1", b"\0\1\0\0\xff\xff\xff\xff"]
     decoded = ColumnDecoder(message, message.leaves()).decode(batch(rows))
@@ -203,7 +208,7 @@ def test_mis_sized_messages_are_counted_and_the_others_kept():
 
 
 def test_invalid_text_is_counted():
-    message = one("std_msgs/msg/String")
+    message = ros_type("std_msgs/msg/String")
     rows = [
         bytes.fromhex("00010000 02000000 ff00"),
         bytes.fromhex("00010000 02000000 6161"),
@@ -218,7 +223,7 @@ def test_invalid_text_is_counted():
 
 
 @pytest.mark.parametrize(
-    ("definition", "says"),
+    ("definition", "message"),
     [
         ("wstring name", "wstring"),
         ("pkg/Missing inner", "not defined"),
@@ -228,13 +233,13 @@ def test_invalid_text_is_counted():
         ("=this is no definition", "cannot be parsed"),
     ],
 )
-def test_what_cannot_be_decoded_is_named(definition, says):
-    with pytest.raises(CannotDecode, match=says):
-        one("pkg/msg/T", definition)
+def test_undecodable_definition_is_reported(definition, message):
+    with pytest.raises(CannotDecode, match=message):
+        ros_type("pkg/msg/T", definition)
 
 
-def test_rows_that_are_wrong_in_many_ways_still_all_get_counted():
-    message = one("diagnostic_msgs/msg/DiagnosticArray")
+def test_every_damaged_row_is_counted():
+    message = ros_type("diagnostic_msgs/msg/DiagnosticArray")
     rng = np.random.default_rng(3)
     rows = [
         b"\0\1\0\0" + rng.integers(0, 3, rng.integers(0, 90)).astype(np.uint8).tobytes()

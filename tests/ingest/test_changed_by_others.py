@@ -1,4 +1,4 @@
-"""A store whose Delta tables another tool has changed."""
+"""Stores whose Delta tables another tool has changed."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ def store(tmp_path: Path) -> Path:
 
 
 def with_protocol(store: Path, name: str = TRANSITIONS, **protocol: object) -> Path:
-    """Return a commit that changes a table's protocol, as Spark writes it."""
+    """Commit a protocol change of a table, as Spark writes it."""
     log = store / name / "_delta_log"
     number = len(list(log.glob("*.json")))
     text = json.dumps({"protocol": protocol}) + "\n"
@@ -39,24 +39,24 @@ def features(*names: str, reading: bool = True) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("feature", ["deletionVectors", "typeWidening", "fromTheFuture"])
-def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, feature, shell):
-    """Rows that deletion vectors delete are in the Parquet files still."""
+def test_unknown_reader_feature_is_rejected_by_name(store, feature, shell):
+    """Rows removed by deletion vectors are still in the Parquet files."""
     before = sum(shown(store).values())
     with_protocol(store, **features(feature))
     for verb in (["sql", str(store), "FROM coverage"], ["store", "compact", str(store)]):
-        said = shell.err(*verb)
-        assert f"its table `transitions` uses Delta's feature `{feature}`" in said
-        assert "DROP FEATURE" in said
-        assert "Traceback" not in said
+        stderr = shell.err(*verb)
+        assert f"its table `transitions` uses Delta's feature `{feature}`" in stderr
+        assert "DROP FEATURE" in stderr
+        assert "Traceback" not in stderr
     with pytest.raises(StoreError, match=feature):
         StoreWriter(store).write(*one(3))
-    if feature != "fromTheFuture":  # which Delta's library does not open at all
+    if feature != "fromTheFuture":  # Delta's library cannot open a table with this feature at all
         with Store(store, version=1) as earlier:
             assert earlier.sql("SELECT count(*) FROM transitions").fetchall() == [(before,)]
 
 
 @pytest.mark.parametrize(
-    ("protocol", "said"),
+    ("protocol", "message"),
     [
         (features("rowTracking", "domainMetadata", reading=False), "feature `rowTracking`"),
         ({"minReaderVersion": 1, "minWriterVersion": 6}, "feature `identityColumns`"),
@@ -64,19 +64,19 @@ def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, feature, s
     ],
 )
 @pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
-def test_a_writer_feature_that_is_not_known_refuses_to_write(store, protocol, said, name):
+def test_unknown_writer_feature_prevents_writing(store, protocol, message, name):
     before = shown(store)
     with_protocol(store, name, **protocol)
     writer = StoreWriter(store)
     files = {path for path in store.rglob("*") if path.is_file()}
     for write in (lambda: writer.write(*one(3)), lambda: compact(writer)):
-        with pytest.raises(StoreError, match=f"`{name}` uses Delta's {said}.*nothing changed"):
+        with pytest.raises(StoreError, match=f"`{name}` uses Delta's {message}.*nothing changed"):
             write()
-    assert shown(store) == before  # reading is allowed
+    assert shown(store) == before  # reading is still allowed
     assert {path for path in store.rglob("*") if path.is_file()} == files
 
 
-def test_a_constraint_of_delta_is_not_passed_over(store):
+def test_delta_check_constraint_prevents_writing(store):
     table = DeltaTable(str(store / TRANSITIONS))
     table.alter.add_constraint({"forward": "step_index >= 0"})
     with pytest.raises(StoreError, match="feature `checkConstraints`"):
@@ -86,7 +86,7 @@ def test_a_constraint_of_delta_is_not_passed_over(store):
     assert len(shown(store)) == 3
 
 
-def test_an_append_only_table_gets_new_recordings_and_loses_none(store, monkeypatch):
+def test_append_only_table_accepts_only_new_recordings(store, monkeypatch):
     monkeypatch.setattr(commits, "ATTEMPTS", 1)
     DeltaTable(str(store / TRANSITIONS)).alter.set_table_properties({"delta.appendOnly": "true"})
     before = shown(store)
@@ -98,7 +98,7 @@ def test_an_append_only_table_gets_new_recordings_and_loses_none(store, monkeypa
     assert len(shown(store)) == 3
 
 
-def test_features_that_are_not_in_use_change_nothing(store):
+def test_unused_features_do_not_prevent_writing(store):
     with_protocol(
         store,
         minReaderVersion=3,
@@ -115,13 +115,13 @@ def test_features_that_are_not_in_use_change_nothing(store):
 
 
 def changed(store: Path, way: str) -> dict[str, int]:
-    """Rows changed by Delta's own library, which writes text as views; rows per ingest then."""
+    """Change rows with Delta's own library, which writes string views; return rows per ingest."""
     table = DeltaTable(str(store / TRANSITIONS))
     if way == "deleted":
         table.delete("step_index < 3")
     elif way == "updated":
         updates = {"behaviour_version": "'v2'", "reward": "-1.0", "zone": "'moved'"}
-        table.update(updates=updates, predicate="action = 2")  # which changes no number of rows
+        table.update(updates=updates, predicate="action = 2")  # keeps the number of rows
     else:
         gone = pa.table({"transition_id": one(1)[1]["transition_id"].slice(0, 5)})
         merging = table.merge(
@@ -139,7 +139,7 @@ def changed(store: Path, way: str) -> dict[str, int]:
     }
 
 
-def same_as_rows(store: Path) -> None:
+def assert_summaries_match_rows(store: Path) -> None:
     """Check that views from summaries agree with the table's active files."""
     files = DeltaTable(str(store / TRANSITIONS)).file_uris()
     rows, rewards, zones = duckdb.sql(
@@ -147,19 +147,19 @@ def same_as_rows(store: Path) -> None:
         f" FROM read_parquet({files}, union_by_name = true)"
     ).fetchall()[0]
     with Store(store) as opened:
-        said = opened.sql(
+        summaries = opened.sql(
             "SELECT sum(primary_rows), (SELECT sum(steps) FROM episodes),"
             " (SELECT sum(transitions) FROM recordings), list(DISTINCT zone ORDER BY zone)"
             " FROM coverage"
         ).fetchall()
         returns = opened.sql("SELECT sum(return) FROM episodes").fetchall()[0][0]
-    assert said == [(rows, rows, rows, zones)]
+    assert summaries == [(rows, rows, rows, zones)]
     assert returns == pytest.approx(rewards)
 
 
 @pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
-def test_rows_changed_by_another_tool_count_and_are_joined(store, way, shell):
-    """Summaries never outvote the rows."""
+def test_rows_changed_by_another_tool_are_used(store, way, shell):
+    """Views use the rows, not summaries that another tool made stale."""
     expected = changed(store, way)
     kinds = {
         str(kind)
@@ -168,7 +168,7 @@ def test_rows_changed_by_another_tool_count_and_are_joined(store, way, shell):
     }
     assert "string_view" in kinds
     assert shown(store) == expected
-    same_as_rows(store)
+    assert_summaries_match_rows(store)
     with Store(store) as opened:
         changes = len(opened.changed_by_others)
     assert changes == (1 if way == "merged" else 2)
@@ -180,14 +180,14 @@ def test_rows_changed_by_another_tool_count_and_are_joined(store, way, shell):
     assert kept.schema.field("zone").type == pa.string()
     assert len(kept) == expected[f"{2:016x}-a"]
     writer.write(*one(3))
-    writer.write(*one(1, "b"))  # writes the others of its file again
-    same_as_rows(store)
+    writer.write(*one(1, "b"))  # also rewrites the other recordings of its file
+    assert_summaries_match_rows(store)
     assert compact(writer).summaries == (0 if way == "merged" else 1)
     assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(kept)
     with Store(store) as opened:
         assert opened.changed_by_others == []
         assert "cells" in str(opened.sql("EXPLAIN FROM coverage").fetchall())
-    same_as_rows(store)
+    assert_summaries_match_rows(store)
     assert not compact(StoreWriter(store)).summaries
     writer.remove_recordings({f"{3:016x}": f"{3:016x}-a"}, "remove")
     assert shown(store) == {

@@ -1,4 +1,4 @@
-"""Clocks compared, and log time mapped at another pace: rows pair what belonged together."""
+"""Clock comparison, and log time mapped at another pace so that rows pair simultaneous messages."""
 
 import itertools
 from pathlib import Path
@@ -26,16 +26,16 @@ def topic(stamps: list[int], logs: list[int] | None = None) -> TopicColumns:
     return TopicColumns(log, log - 2, {STAMP: stamp})
 
 
-def test_a_clock_that_is_set_jumps_and_one_bad_stamp_is_no_jump():
+def test_set_clock_is_a_jump_and_single_bad_stamp_is_not():
     logs = [NS * n for n in range(1, 41)]
     stamps = [log - (0 if log <= 20 * NS else 30 * NS) for log in logs]
     assert topic_clock("/t", topic(stamps, logs)).jumps == 1
-    once = [*logs[:10], logs[10] - 30 * NS, *logs[11:]]
-    assert topic_clock("/t", topic(once, logs)).jumps == 0
+    single_bad = [*logs[:10], logs[10] - 30 * NS, *logs[11:]]
+    assert topic_clock("/t", topic(single_bad, logs)).jumps == 0
 
 
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=30), st.integers(-(10**18), 10**18))
-def test_counts_are_those_of_python(stamps, offset):
+def test_clock_counts_match_plain_python(stamps, offset):
     logs = [stamp + offset for stamp in stamps]
     found = topic_clock("/t", topic(stamps, logs))
     assert found.backsteps == sum(b < a for a, b in itertools.pairwise(stamps))
@@ -44,8 +44,8 @@ def test_counts_are_those_of_python(stamps, offset):
     assert found.zero_stamps == len(stamps) - len(reported)
 
 
-class Odd(Drive):
-    """Odometry that repeats a stamp, steps back once and says zero once."""
+class FaultyOdometryDrive(Drive):
+    """Drive whose odometry repeats a stamp, steps back once and reports zero once."""
 
     def topics(self) -> dict[str, TopicColumns]:
         found = super().topics()
@@ -58,18 +58,20 @@ class Odd(Drive):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_bag(Odd(), tmp_path_factory.mktemp("clocks") / "bag")
+    return write_bag(FaultyOdometryDrive(), tmp_path_factory.mktemp("clocks") / "bag")
 
 
-def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, shell):
+def test_clock_faults_are_stored_and_printed(bag, tmp_path, shell):
     store = tmp_path / "store"
-    shown = shell.out("ingest", bag, "--store", store, code=3)  # the zero stamp is lost
-    line = " ".join(shown[shown.index(" /odom ") :].split())  # long cells are wrapped
-    # 19 -> 20 and 29 -> 30 go back; and the zero stamp is off the clock, so it is left out.
+    # the message with the zero stamp is lost
+    shown = shell.out("ingest", bag, "--store", store, code=3)
+    line = " ".join(shown[shown.index(" /odom ") :].split())  # long cells wrap
+    # The stamps step back at 19 -> 20 and 29 -> 30. The zero stamp is off the clock, so it is
+    # dropped.
     assert "2 backsteps, 1 repeated stamp, 1 zero stamp, 1 left out" in line
     assert "0.002" in line[: line.index("backsteps")]
-    question = "SELECT unnest(clocks, recursive := true) FROM recordings"
-    rows = {row["topic"]: row for row in shell.json("sql", store, question)}
+    query = "SELECT unnest(clocks, recursive := true) FROM recordings"
+    rows = {row["topic"]: row for row in shell.json("sql", store, query)}
     odom = rows["/odom"]
     assert (odom["messages"], odom["offset_ns"], odom["stamped"]) == (300, 2_000_000, True)
     assert (odom["backsteps"], odom["duplicates"], odom["zero_stamps"]) == (2, 1, 1)
@@ -80,15 +82,16 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, shell):
 
 def test_messages_logged_out_of_order_are_counted(tmp_path, shell):
     # Its messages step back in log time once; see bag_samples.
-    (said,) = shell.json("info", write_mcap(tmp_path / "a.mcap"), "--clocks")["recordings"]
-    assert said["topics"]["/odom"]["clock"]["log_backsteps"] == 1
+    (recording,) = shell.json("info", write_mcap(tmp_path / "a.mcap"), "--clocks")["recordings"]
+    assert recording["topics"]["/odom"]["clock"]["log_backsteps"] == 1
 
 
 DAY = 1_700_000_000 * NS
 
 
-def test_a_pause_is_a_flat_piece_and_a_constant_offset_one_knot() -> None:
-    log = DAY + np.array([0, 1, 2, 12, 13], np.int64) * NS  # the simulation stood for ten seconds
+def test_clock_map_of_a_pause_and_of_constant_offset() -> None:
+    # the simulation was paused for ten seconds
+    log = DAY + np.array([0, 1, 2, 12, 13], np.int64) * NS
     stamp = np.array([0, 1, 2, 2, 3], np.int64) * NS
     fitted = ClockMap.through(log, stamp)
     assert fitted.stamped(DAY + np.array([7 * NS, 12 * NS + NS // 2])).tolist() == [
@@ -101,23 +104,23 @@ def test_a_pause_is_a_flat_piece_and_a_constant_offset_one_knot() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**12), st.integers(0, 10**12)), min_size=1, max_size=40))
-def test_it_never_goes_back_and_meets_its_newest_stamps(pairs: list[tuple[int, int]]) -> None:
+def test_clock_map_is_monotonic_and_meets_newest_stamps(pairs: list[tuple[int, int]]) -> None:
     log, stamp = (np.array(column, np.int64) + DAY for column in zip(*pairs, strict=True))
     fitted = ClockMap.through(log, stamp)
     at = np.sort(
         np.concatenate([log, log + 1, np.linspace(log.min(), log.max(), 50).astype(np.int64)])
     )
     assert (np.diff(fitted.stamped(at)) >= 0).all()
-    for one in np.unique(log):
-        newest = stamp[log <= one].max()
-        assert fitted.stamped(np.array([one]))[0] == newest
+    for log_ns in np.unique(log):
+        newest = stamp[log <= log_ns].max()
+        assert fitted.stamped(np.array([log_ns]))[0] == newest
 
 
 PACES = [0.5, 0.97, 1.0]
 
 
 def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
-    """Return messages received at `pace` of log time; `pause` is (stamped, log time) in s."""
+    """Return messages received at `pace` of log time; `pause` is (stamp, log time) in s."""
 
     def received(times: np.ndarray) -> np.ndarray:
         since = times - START_NS
@@ -133,7 +136,7 @@ def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, fl
 
 
 def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
-    """Return a drive whose command is the x at which it was given: each row tells when it was."""
+    """Return a drive whose speed command encodes the x at which it was given, hence its time."""
     topics = Drive(duration_s, goals=[(0.0, 40.0, 1.0)]).topics()
     command = topics["/cmd_vel"]
     given_s = (command.log_time_ns - START_NS) * 1e-9
@@ -142,13 +145,13 @@ def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
 
 
 @pytest.mark.parametrize("pace", PACES)
-def test_command_and_state_of_a_row_are_within_one_hold(pace: float) -> None:
+def test_command_and_state_of_row_are_within_one_hold(pace: float) -> None:
     profile = load_profile("warehouse_amr")
     whole = steps_of(profile, turning())
     steps = steps_of(profile, at_pace(turning(), pace))
     assert len(steps) >= len(whole) - 2
     apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
-    assert apart_s.max() <= 0.1 + 0.02  # a pose each .1 s, odometry (the reference) each .02 s
+    assert apart_s.max() <= 0.1 + 0.02  # a pose every 0.1 s, odometry (the reference) every 0.02 s
     assert not steps.clock.off_clock
     if pace != 1.0:
         assert steps.clock.pace == pytest.approx(pace, abs=1e-3)
@@ -157,11 +160,11 @@ def test_command_and_state_of_a_row_are_within_one_hold(pace: float) -> None:
 
 
 def logged_s(stamp_ns: np.ndarray, pace: float) -> np.ndarray:
-    """When what is stamped so was received, in seconds from the start, with the drive's latency."""
+    """Return reception times of these stamps in s from the start, with the drive's latency."""
     return ((stamp_ns - START_NS) + LATENCY_NS) * 1e-9 / pace
 
 
-def test_a_clock_that_was_set_has_the_log_times_of_each_part() -> None:
+def test_set_clock_keeps_log_times_of_both_segments() -> None:
     topics = turning()
     for columns in topics.values():
         late = columns.log_time_ns >= START_NS + 15 * NS
@@ -173,15 +176,15 @@ def test_a_clock_that_was_set_has_the_log_times_of_each_part() -> None:
     assert np.ptp(steps.logged_ns) * 1e-9 == pytest.approx(29.8, abs=0.5)
 
 
-class Slow(Drive):
-    """A drive in a simulation at .3 of real time."""
+class SlowSimulationDrive(Drive):
+    """Drive in a simulation at 0.3 of real time."""
 
     def topics(self) -> dict[str, TopicColumns]:
         return at_pace(super().topics(), 0.3)
 
 
-def test_rows_have_their_log_time_in_sql(tmp_path: Path) -> None:
-    bag = write_bag(Slow(12.0), tmp_path / "bag")
+def test_log_time_of_rows_in_sql(tmp_path: Path) -> None:
+    bag = write_bag(SlowSimulationDrive(12.0), tmp_path / "bag")
     query = "SELECT stamp_ns, logged_ns, epoch_ns(logged_time) AS at_ns FROM transitions"
     with ingested(bag, "warehouse_amr", tmp_path / "s") as opened:
         rows = opened.sql(query).fetchnumpy()
@@ -192,7 +195,7 @@ def test_rows_have_their_log_time_in_sql(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pace", PACES)
-def test_a_pause_costs_no_row_and_pairs_nothing_wrongly(pace: float) -> None:
+def test_pause_loses_no_row_and_keeps_pairs(pace: float) -> None:
     profile = load_profile("warehouse_amr")
     steps = steps_of(profile, at_pace(turning(), pace, pause=(12.0, 0.6)))
     apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
@@ -200,7 +203,7 @@ def test_a_pause_costs_no_row_and_pairs_nothing_wrongly(pace: float) -> None:
     assert apart_s.max() <= 0.12
 
 
-def test_a_simulation_reset_starts_a_segment_with_its_own_map() -> None:
+def test_simulation_reset_starts_segment_with_own_map() -> None:
     profile = load_profile("warehouse_amr")
     first = at_pace(turning(20.0), 0.5)
     second = at_pace(turning(20.0), 0.9)
@@ -221,9 +224,9 @@ def test_a_simulation_reset_starts_a_segment_with_its_own_map() -> None:
     assert len(steps) >= 195
 
 
-def test_clock_is_followed_where_it_was_recorded() -> None:
-    stamp = np.arange(0, 20 * NS, NS // 2, dtype=np.int64)  # a stamped topic, twice a second
-    time = np.arange(0, 20 * NS, NS // 50, dtype=np.int64)  # /clock, fifty times
+def test_recorded_clock_topic_maps_log_time() -> None:
+    stamp = np.arange(0, 20 * NS, NS // 2, dtype=np.int64)  # a stamped topic at 2 Hz
+    time = np.arange(0, 20 * NS, NS // 50, dtype=np.int64)  # /clock at 50 Hz
     pace = np.where(time < 10 * NS, 2.0, 1.25)  # half speed, then four fifths
     log = START_NS + np.concatenate([[0], np.cumsum(np.diff(time) * pace[:-1])]).astype(np.int64)
     topics = {
@@ -237,7 +240,7 @@ def test_clock_is_followed_where_it_was_recorded() -> None:
     assert "/clock" not in segment.topics
 
 
-def test_what_cannot_be_mapped_is_refused_with_the_remedy() -> None:
+def test_unmappable_log_time_is_rejected_with_remedy() -> None:
     rng = np.random.default_rng(0)
     stamp = np.arange(0, 60 * NS, NS // 2, dtype=np.int64)
     log = START_NS + np.sort(stamp * 3 // 2 + rng.integers(0, 600_000_000, len(stamp)))
@@ -250,5 +253,5 @@ def test_what_cannot_be_mapped_is_refused_with_the_remedy() -> None:
     ) as e:
         align(topics, Clock())
     assert e.value.remedy == 'set [clock] alignment = "log_time" in the profile'
-    del topics["/cmd"]  # nothing is without a stamp: there is nothing to map
+    del topics["/cmd"]  # every remaining topic is stamped, so no map is needed
     assert len(align(topics, Clock())[0][0].topics["/odom"].row) == 120

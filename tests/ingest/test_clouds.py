@@ -1,4 +1,4 @@
-"""A robot with a 3-D lidar alone: a slice of its point clouds is read as a scan."""
+"""Robots with only a 3-D lidar: a slice of the point clouds is read as a scan."""
 
 import re
 from dataclasses import replace
@@ -48,7 +48,7 @@ def packed(
     rows: int = 1,
     pad: int = 0,
 ) -> dict[str, Any]:
-    """Return the fields of a cloud of points (P, 3), laid out like this."""
+    """Return the fields of a cloud of points (P, 3) in this layout."""
     kind = np.dtype([(name, order + one) for name, one in layout])
     if step:
         formats, offsets = zip(*(kind.fields[name] for name in kind.names), strict=True)
@@ -71,44 +71,44 @@ def packed(
     }
 
 
-def scans(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, np.ndarray]:
-    """Return what is read of clouds, from their columns."""
+def scans_from(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, np.ndarray]:
+    """Return the scans read from the columns of these clouds."""
     columns: dict[str, Any] = {}
     for path, place in (("name", 0), ("offset", 1), ("datatype", 2)):
-        values = [np.array([field[place] for field in one["fields"]]) for one in clouds]
+        values = [np.array([field[place] for field in cloud["fields"]]) for cloud in clouds]
         offsets = offsets_of(np.array([len(value) for value in values]))
         columns[f"fields[].{path}"] = Ragged(np.concatenate(values), offsets)
     for path in ("height", "width", "point_step", "row_step", "is_bigendian"):
-        columns[path] = np.array([one[path] for one in clouds])
-    data = [one["data"] for one in clouds]
+        columns[path] = np.array([cloud[path] for cloud in clouds])
+    data = [cloud["data"] for cloud in clouds]
     columns["data"] = Ragged(np.concatenate(data), offsets_of(np.array([len(d) for d in data])))
     return cloud_reduction(source, 0.05).apply(columns)
 
 
 def around(count: int = 1200, seed: int = 0) -> np.ndarray:
-    """Return points all around, on the floor to above the robot, some of them NaN."""
+    """Return points all around, from the floor to above the robot, some of them NaN."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-6, -6, -1), (6, 6, 2), (count, 3)).astype(np.float32)
     xyz[::7, 1] = np.nan
     return xyz
 
 
-def test_a_scan_is_the_nearest_point_of_the_slice_in_each_beam():
+def test_beam_range_is_nearest_point_of_slice():
     xyz = around().astype(np.float64)
     expected = np.full(720, np.inf)
-    for x, y, z in xyz[np.isfinite(xyz).all(axis=1)]:  # one by one, as the ROS node does
+    for x, y, z in xyz[np.isfinite(xyz).all(axis=1)]:  # point by point, as the ROS node does
         if -0.2 <= z <= 0.6 and np.hypot(x, y) >= 0.05:
             beam = min(int((np.arctan2(y, x) + np.pi) / BEAM_RAD), 719)
             expected[beam] = min(expected[beam], np.hypot(x, y))
-    found = scans([packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")])])
+    found = scans_from([packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")])])
     np.testing.assert_allclose(found["ranges"][0], expected, rtol=1e-6)
     assert np.isfinite(expected).sum() > 100
     assert found["angle_min"][0] == pytest.approx(BEAM_RAD / 2 - np.pi)
 
 
-def test_every_layout_of_the_same_points_is_the_same_scan():
+def test_point_layout_does_not_change_scan():
     xyz = around()
-    found = scans(
+    found = scans_from(
         [
             packed(xyz),
             packed(
@@ -123,14 +123,14 @@ def test_every_layout_of_the_same_points_is_the_same_scan():
     assert (found["ranges"] == found["ranges"][0]).all()
 
 
-def test_bearings_and_a_lidar_upside_down():
+def test_bearing_limits_and_upside_down_lidar():
     wall = np.array([[2.0, 1.0, 0.5], [2.0, -1.0, 0.5], [-3.0, 0.0, 0.5]])
     ahead = {"angle_rad": (-np.pi / 2, np.pi / 2)}
-    (seen,) = scans([packed(wall)], structs.replace(SOURCE, **ahead))["ranges"]
+    (seen,) = scans_from([packed(wall)], structs.replace(SOURCE, **ahead))["ranges"]
     assert seen.shape == (360,)
     assert np.isfinite(seen).sum() == 2
     turned = {"upside_down": True, "height_m": (-0.6, -0.4)}
-    (seen,) = scans([packed(wall)], structs.replace(SOURCE, **turned))["ranges"]
+    (seen,) = scans_from([packed(wall)], structs.replace(SOURCE, **turned))["ranges"]
     assert np.isfinite(seen).sum() == 3
 
 
@@ -138,18 +138,18 @@ WHOLE, NOTHING = packed(around()), np.full((4, 3), np.nan)
 UNREAD = "cut short, or has no x, y, z as floats"
 UNSEEN = "no beam has a valid range"
 UNUSABLE = {
-    "cut short": (WHOLE | {"data": WHOLE["data"][:-5]}, UNREAD),
-    "without z": (packed(around(), PLAIN[:2]), UNREAD),
-    "of whole numbers": (packed(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
-    "beyond a point": (WHOLE | {"point_step": 8}, UNREAD),
-    "with rows that overlap": (packed(around(), rows=16) | {"row_step": 0}, UNREAD),
+    "truncated": (WHOLE | {"data": WHOLE["data"][:-5]}, UNREAD),
+    "without_z": (packed(around(), PLAIN[:2]), UNREAD),
+    "integers": (packed(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
+    "offset_beyond_point": (WHOLE | {"point_step": 8}, UNREAD),
+    "overlapping_rows": (packed(around(), rows=16) | {"row_step": 0}, UNREAD),
     "empty": (packed(np.zeros((0, 3))), UNSEEN),
-    "of NaN": (packed(NOTHING), UNSEEN),
+    "all_nan": (packed(NOTHING), UNSEEN),
 }
 
 
 def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str = "") -> Path:
-    """Write a drive whose scans are clouds; those from 3 s on are `spoilt`."""
+    """Write a drive whose scans are clouds; those after 3 s are `spoilt`."""
     folder.mkdir()
     drive, bag = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "drive"), folder / "bag"
     point = TYPES.types["sensor_msgs/msg/PointField"]
@@ -187,14 +187,14 @@ def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str =
     return bag
 
 
-def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
+def test_cloud_and_scan_give_same_clearance(tmp_path):
     bag = with_clouds(tmp_path / "clouds")
     by_cloud = steps_in(bag, PROFILE)
     by_scan = steps_in(tmp_path / "clouds" / "drive", WAREHOUSE)
     assert by_cloud.problem == by_scan.problem
     for name in ("sector_clearance_m", "clearance_ahead_m", "plan_return_m"):
         np.testing.assert_allclose(by_cloud.signals[name], by_scan.signals[name], atol=0.02)
-    # What a row saw is a scan, too.
+    # The scan that a row shows comes from the cloud, too.
     profile = parse_profile(PROFILE, where="cloud.toml")
     with open_recording(bag) as recording:
         start_ns = recording.span_ns[0]
@@ -205,26 +205,26 @@ def test_a_drive_with_clouds_has_the_clearance_of_its_scans(tmp_path):
 
 
 @pytest.mark.parametrize("kind", UNUSABLE)
-def test_an_unusable_cloud_drops_its_steps_with_the_reason(kind, tmp_path):
+def test_unusable_cloud_drops_steps_with_reason(kind, tmp_path):
     spoilt, reason = UNUSABLE[kind]
     problems = steps_in(with_clouds(tmp_path / "clouds", spoilt), PROFILE).problem
     assert set(problems) == {"", f"scan: {reason}"}
 
 
-def test_a_cloud_in_a_fixed_frame_is_refused(tmp_path):
+def test_cloud_in_fixed_frame_is_rejected(tmp_path):
     bag = with_clouds(tmp_path / "clouds", frame="robot1/odom")
     with pytest.raises(RecordingError, match="its points in the frame robot1/odom"):
         steps_in(bag, PROFILE)
 
 
-def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
-    bag = with_clouds(tmp_path / "clouds", UNUSABLE["cut short"][0])
+def test_live_observer_and_ingest_agree_on_clouds(tmp_path):
+    bag = with_clouds(tmp_path / "clouds", UNUSABLE["truncated"][0])
     alike = seen_alike(bag, parse_profile(PROFILE, where="p"), steps_in(bag, PROFILE))
     assert min(alike[""], alike[f"scan: {UNREAD}"]) > 5
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "what"),
+    ("old", "new", "message"),
     [
         ("height_m = [-0.2, 0.6]\n", "", r"height_m = \[LOW, HIGH\] above the lidar"),
         ("[-0.2, 0.6]", "[0.6, -0.2]", r"height_m` must be \[LOW, HIGH\]"),
@@ -232,12 +232,12 @@ def test_a_running_robot_sees_by_clouds_what_ingest_stores(tmp_path):
         ("PointCloud2", "LaserScan", "height_m` applies only to sensor_msgs/msg/PointCloud2"),
     ],
 )
-def test_what_makes_no_scan_of_a_cloud_is_refused(old, new, what):
-    with pytest.raises(ConfigError, match=what):
+def test_invalid_cloud_settings_are_rejected(old, new, message):
+    with pytest.raises(ConfigError, match=message):
         parse_profile(PROFILE.replace(old, new, 1), where="cloud.toml")
 
 
-def test_a_proposal_says_how_to_read_a_cloud(tmp_path, shell):
+def test_proposal_contains_cloud_settings(tmp_path, shell):
     bag, profile = with_clouds(tmp_path / "clouds"), tmp_path / "robot.toml"
     assert "a slice can be read as a scan" in shell.err(
         "profile", "new", bag, "--out", profile, code=0

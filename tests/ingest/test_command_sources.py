@@ -1,4 +1,4 @@
-"""Who drove, by whose command was in force: a multiplexer's inputs, a button, our own node."""
+"""Drivers of a robot, known from its commands: multiplexer inputs, a button, our own node."""
 
 from pathlib import Path
 from typing import Any
@@ -39,22 +39,22 @@ fields = { pressed = "buttons[4]" }
 """
 
 
-def twists(time_s: Any, speed_mps: Any, turn_radps: Any) -> TopicColumns:
+def twist_columns(time_s: Any, speed_mps: Any, turn_radps: Any) -> TopicColumns:
     fields = {"linear.x": np.asarray(speed_mps), "angular.z": np.asarray(turn_radps)}
     return columns(time_s, fields, stamped=False)
 
 
 def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
-    """Navigation drives; between 4 and 7 s a person does; a multiplexer passes on who counts."""
+    """Return a drive of navigation, with a person driving from 4 to 7 s, through a multiplexer."""
     drive = Drive(duration_s)
     names = {"/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped"}
     topics = drive.topics()
-    found = {name: (kind, topics[name]) for name, kind in names.items()}
-    found["/odom"] = ("nav_msgs/msg/Odometry", topics["/odom"])
+    typed = {name: (kind, topics[name]) for name, kind in names.items()}
+    typed["/odom"] = ("nav_msgs/msg/Odometry", topics["/odom"])
     nav_s = np.arange(0, duration_s, 0.1)
     hand_s = np.arange(*TAKEN_OVER_S, 0.1) + 0.03
-    nav = twists(nav_s, 0.4 + 0.01 * np.sin(nav_s), 0.1 * np.cos(nav_s))
-    hand = twists(hand_s, np.full(len(hand_s), 0.2), np.linspace(-0.3, 0.3, len(hand_s)))
+    nav = twist_columns(nav_s, 0.4 + 0.01 * np.sin(nav_s), 0.1 * np.cos(nav_s))
+    hand = twist_columns(hand_s, np.full(len(hand_s), 0.2), np.linspace(-0.3, 0.3, len(hand_s)))
     start, end = TAKEN_OVER_S
     drives = (nav_s < start) | (nav_s > end)
     out_s = np.concatenate([nav_s[drives], hand_s]) + 0.002
@@ -68,21 +68,21 @@ def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
     buttons = np.zeros((len(joy_s), 8), np.int32)
     buttons[:, 4] = held
     each = offsets_of(np.full(len(joy_s), 8))
-    found |= {
+    typed |= {
         NAV: (TWIST, nav),
         TELEOP: (TWIST, hand),
-        OUT: (TWIST, twists(out_s[order], *out)),
+        OUT: (TWIST, twist_columns(out_s[order], *out)),
         JOY: (
             "sensor_msgs/msg/Joy",
             columns(joy_s, {"buttons": Ragged(buttons.reshape(-1), each)}),
         ),
     }
-    return found
+    return typed
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return a proposal without its sources of commands."""
+    """Return the text of a proposal without its command sources."""
     folder = tmp_path_factory.mktemp("plain")
     proposed(write_topics(taken_over(), folder / "bag"), file := folder / "p.toml")
     kept, skip = [], False
@@ -93,29 +93,31 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def profile_of(plain: str, folder: Path, sources: str) -> Path:
-    """Return the proposal with these sources of commands."""
+    """Write the proposal with these command sources."""
     (folder / "p.toml").write_text(plain + sources)
     return folder / "p.toml"
 
 
-def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
-    """Seconds from the start and who drove, of each row."""
+def driver_per_row(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
+    """Return each row's time in seconds from the start and its driver."""
     with ingested(bag, profile, store) as opened:
         rows = opened.sql("SELECT stamp_ns, behaviour_policy FROM transitions ORDER BY 1")
         return [((stamp - START_NS) * 1e-9, policy) for stamp, policy in rows.fetchall()]
 
 
-def drivers(topics: dict[str, tuple[str, TopicColumns]], text: str) -> list[tuple[float, str]]:
-    """Seconds from the start and who drove, of each step by the text of a profile."""
+def driver_per_step(
+    topics: dict[str, tuple[str, TopicColumns]], text: str
+) -> list[tuple[float, str]]:
+    """Return each step's time in seconds from the start and its driver, by a profile's text."""
     profile = parse_profile(text, where="p")
     steps = steps_of(profile, {name: one for name, (_, one) in topics.items()})
     at_s = ((steps.signals["stamp_ns"] - START_NS) * 1e-9).tolist()
     return list(zip(at_s, steps.policy, strict=True))
 
 
-def test_the_source_whose_command_is_in_force_is_who_drove(plain, tmp_path, capsys):
+def test_driver_is_source_of_command_in_force(plain, tmp_path, capsys):
     bag = write_topics(taken_over(), tmp_path / "bag")
-    rows = policies(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
+    rows = driver_per_row(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
     assert len(rows) > 50
     by_hand = [s for s, policy in rows if policy == "teleop"]
     assert min(by_hand) == pytest.approx(TAKEN_OVER_S[0], abs=0.2)
@@ -125,32 +127,31 @@ def test_the_source_whose_command_is_in_force_is_who_drove(plain, tmp_path, caps
     assert "whose command it equals: navigation, teleop" in capsys.readouterr().out
 
 
-def test_a_button_says_it_where_no_source_has_the_command(plain):
+def test_pressed_button_names_driver_without_source(plain):
     topics = taken_over()
     del topics[TELEOP], topics[NAV]
-    rows = drivers(topics, plain + PRESSED)
+    rows = driver_per_step(topics, plain + PRESSED)
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"unknown"}
 
 
-def test_no_later_command_says_who_drives_now(plain):
-    """What sources say after a moment changes nobody before it."""
+def test_driver_does_not_depend_on_later_commands(plain):
     topics, late = taken_over(), START_NS + 5 * 10**9
-    before = drivers(topics, plain + SOURCES)
+    before = driver_per_step(topics, plain + SOURCES)
     for name in (NAV, TELEOP):
         columns_ = topics[name][1]
         columns_.fields["linear.x"][columns_.log_time_ns > late] = 0.9
-    other = drivers(topics, plain + SOURCES)
+    other = driver_per_step(topics, plain + SOURCES)
     assert [p for s, p in before if s < 4.9] == [p for s, p in other if s < 4.9]
     assert {p for s, p in other if s > 5.2} == {"unknown"}
 
 
-def test_a_recording_without_sources_has_unknown_drivers(plain):
+def test_drivers_are_unknown_without_sources(plain):
     hashes = {parse_profile(text, where="p").hash for text in (plain + SOURCES, plain)}
     assert len(hashes) == 2
     topics = taken_over()
     del topics[NAV], topics[TELEOP], topics[JOY]
-    assert {policy for _, policy in drivers(topics, plain + SOURCES)} == {"unknown"}
+    assert {policy for _, policy in driver_per_step(topics, plain + SOURCES)} == {"unknown"}
 
 
 MUX, STEP = "/chosen", np.array([0.025, 0.06])
@@ -164,47 +165,47 @@ max_age_s = 0.4
 
 
 def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
-    """Return the drive, its output smoothed to 20 Hz and times `limit` from 9 to 10 s."""
+    """Return the drive with its output smoothed to 20 Hz, and times `limit` from 9 to 10 s."""
     topics = taken_over()
     chosen = topics.pop(OUT)[1]
     reported = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
-    told_s = (chosen.log_time_ns - START_NS) * 1e-9
-    out_s, now, out = np.arange(0.1, 12, 0.05) + 0.013, np.zeros(2), []
+    reported_s = (chosen.log_time_ns - START_NS) * 1e-9
+    out_s, smooth, out = np.arange(0.1, 12, 0.05) + 0.013, np.zeros(2), []
     for at in out_s:
-        target = reported[np.searchsorted(told_s, at, "right") - 1]
-        now = now + np.clip(target - now, -STEP, STEP)
-        out.append(now * (limit if 9 < at < 10 else 1.0))
-    topics[OUT] = (TWIST, twists(out_s, *np.transpose(out)))
+        target = reported[np.searchsorted(reported_s, at, "right") - 1]
+        smooth = smooth + np.clip(target - smooth, -STEP, STEP)
+        out.append(smooth * (limit if 9 < at < 10 else 1.0))
+    topics[OUT] = (TWIST, twist_columns(out_s, *np.transpose(out)))
     topics[MUX] = (TWIST, chosen)
     return topics
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.4])
-def test_a_source_is_followed_through_a_smoother(plain, limit):
-    """No smoothed command equals one of any source."""
-    rows = drivers(smoothed(limit), plain + SOURCES + THROUGH)
+def test_source_is_followed_through_smoother(plain, limit):
+    """A smoothed command equals no command of any source."""
+    rows = driver_per_step(smoothed(limit), plain + SOURCES + THROUGH)
     assert len(rows) > 50
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-def test_a_source_is_unknown_where_the_multiplexer_was_silent(plain):
+def test_driver_is_unknown_while_multiplexer_is_silent(plain):
     topics, text = smoothed(), plain + SOURCES + THROUGH
     chosen = topics[MUX][1]
     silent = (chosen.log_time_ns >= START_NS + 8 * NS) & (chosen.log_time_ns <= START_NS + 10 * NS)
-    some = topics | {MUX: (TWIST, without(chosen, ~silent))}
-    rows = drivers(some, text)
+    with_gap = topics | {MUX: (TWIST, without(chosen, ~silent))}
+    rows = driver_per_step(with_gap, text)
     assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
     assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
     del topics[MUX]
-    assert {policy for _, policy in drivers(topics, text)} == {"unknown"}
+    assert {policy for _, policy in driver_per_step(topics, text)} == {"unknown"}
 
 
 CHAIN = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\nfields = {}\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (CHAIN.replace("{}", "{speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}"), "without"),
         (SOURCES + CHAIN.replace("{}", "{speed_mps = 'linear.x'}"), "does not show when this"),
@@ -212,12 +213,12 @@ CHAIN = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\
         (PRESSED.replace("pressed", "presed"), "unknown 'presed'"),
     ],
 )
-def test_sources_that_show_nothing_are_refused(text, said):
-    with pytest.raises(ConfigError, match=said):
+def test_sources_without_driver_information_are_rejected(text, message):
+    with pytest.raises(ConfigError, match=message):
         parse_profile(WAREHOUSE + text, where="p")
 
 
-def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, shell):
+def test_missing_button_field_is_reported_with_its_key(plain, tmp_path, shell):
     bag = write_topics(taken_over(2.0), tmp_path / "bag")
     profile = profile_of(plain, tmp_path, PRESSED.replace("buttons", "button"))
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in shell.err(
@@ -225,22 +226,22 @@ def test_a_button_that_is_not_there_is_named_with_its_key(plain, tmp_path, shell
     )
 
 
-def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path):
-    """Whatever the topics' names: the output is what follows, who drives what it follows."""
+def test_proposal_finds_multiplexer_by_its_commands(tmp_path):
+    """Topic names do not matter: the output is the topic that repeats the others' commands."""
     topics = taken_over()
     topics["/cmd_vel_out_of_planner"] = topics.pop(NAV)
     topics["/wheels/command"] = topics.pop(OUT)
     bag = write_topics(topics, tmp_path / "bag")
     profile = proposed(bag, file := tmp_path / "p.toml")
     assert profile.inputs.command.topic == "/wheels/command"
-    sources = {name: one.topic for name, one in profile.command_sources.items()}
+    sources = {name: source.topic for name, source in profile.command_sources.items()}
     assert sources == {"navigation": "/cmd_vel_out_of_planner", "teleop": TELEOP}
-    rows = policies(bag, file, tmp_path / "s")
+    rows = driver_per_row(bag, file, tmp_path / "s")
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-def test_a_command_that_is_only_a_persons_is_teleop(tmp_path):
+def test_proposed_driver_of_teleop_only_command(tmp_path):
     topics = {n: t for n, t in taken_over().items() if n not in (NAV, TELEOP, JOY)}
     topics["/teleop/cmd_vel"] = topics.pop(OUT)
     bag = write_topics(topics, tmp_path / "bag")
@@ -254,21 +255,21 @@ Topics = dict[str, Any]
 
 
 def driven() -> Topics:
-    """Return a drive of a robot whose logs do not say who drives."""
+    """Return a drive of a robot whose logs do not name the driver."""
     topics: Topics = typed_topics(Drive(duration_s=12.0))
     del topics["/behaviour_policy"]
     return topics
 
 
-def by_operator(kind: str = BOOL) -> Topics:
+def with_takeover(kind: str = BOOL) -> Topics:
     at_s = np.arange(0, 12, 0.2)
     pressed = (at_s >= TAKEN_S[0]) & (at_s < TAKEN_S[1])
     data = pressed if kind == BOOL else np.where(pressed, "yes", "no").astype(object)
     return driven() | {TAKEOVER: (kind, columns(at_s, {"data": data}, stamped=False))}
 
 
-def in_shadow() -> Topics:
-    """Return a drive in which the node proposes and its limiter holds it back."""
+def with_shadow_policy() -> Topics:
+    """Return a drive in which the node proposes commands and its limiter reduces them."""
     at_s = np.arange(0, 12, 0.1)
     half = np.full(len(at_s), 0.2)
     slow = {"linear.x": half, "angular.z": 0 * half}
@@ -282,29 +283,29 @@ def in_shadow() -> Topics:
     }
 
 
-def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
-    bag, file = write_topics(by_operator(), tmp_path / "bag"), tmp_path / "p.toml"
+def test_takeover_rows_have_operator_as_driver(tmp_path):
+    bag, file = write_topics(with_takeover(), tmp_path / "bag"), tmp_path / "p.toml"
     profile = proposed(bag, file)
     assert list(profile.command_sources) == ["operator"]
     assert "shadow_action" not in profile.signals
     with ingested(bag, file, tmp_path / "store") as store:
-        said = store.sql("SELECT stamp_ns, behaviour_policy FROM transitions").fetchall()
-    by_hand = [(stamp - START_NS) * 1e-9 for stamp, policy in said if policy == "operator"]
+        rows = store.sql("SELECT stamp_ns, behaviour_policy FROM transitions").fetchall()
+    by_hand = [(stamp - START_NS) * 1e-9 for stamp, policy in rows if policy == "operator"]
     assert len(by_hand) == pytest.approx((TAKEN_S[1] - TAKEN_S[0]) / 0.2, abs=1)
     assert min(by_hand) >= TAKEN_S[0]
     assert max(by_hand) < TAKEN_S[1] + 0.01
-    assert {policy for _, policy in said} == {"operator", "unknown"}
+    assert {policy for _, policy in rows} == {"operator", "unknown"}
     assert "[signals.restock_takeover]" not in file.read_text()
 
 
-def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
-    bag = write_topics(by_operator("std_msgs/msg/String"), tmp_path / "bag")
+def test_takeover_topic_of_another_type_is_ignored(tmp_path):
+    bag = write_topics(with_takeover("std_msgs/msg/String"), tmp_path / "bag")
     assert proposed(bag, tmp_path / "p.toml").command_sources == {}
 
 
-def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, shell):
-    """In shadow it publishes twists beside the command, more of them."""
-    bag, file = write_topics(in_shadow(), tmp_path / "bag"), tmp_path / "p.toml"
+def test_shadow_policy_is_not_proposed_as_driver(tmp_path, shell):
+    """A shadow policy publishes more twists than the command topic has."""
+    bag, file = write_topics(with_shadow_policy(), tmp_path / "bag"), tmp_path / "p.toml"
     profile = proposed(bag, file)
     assert profile.inputs.command.topic == "/cmd_vel"
     assert profile.inputs.nav_command is None

@@ -1,4 +1,4 @@
-"""Several recordings are committed at once: none is lost, and one that fails costs itself alone."""
+"""Group commits of several recordings: none is lost, and a failing one does not affect others."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 
 
-def waiting(
+def prepared(
     store: StoreWriter,
     recording: tuple[pa.Table, pa.Table],
     repeated: OnRepeat | None = None,
@@ -43,7 +43,7 @@ def group(store: StoreWriter) -> CommitGroup:
 
 
 def versions(store: Path) -> list[int]:
-    """Of both tables: how often each was committed to after it was made."""
+    """Return the Delta version of both tables: their number of commits after creation."""
     return [DeltaTable(str(store / name)).version() for name in ("recordings", "transitions")]
 
 
@@ -51,15 +51,15 @@ def files(store: Path) -> set[str]:
     return {path.relative_to(store).as_posix() for path in store.rglob("*.parquet")}
 
 
-def test_the_first_is_committed_at_once_then_groups(tmp_path):
+def test_first_recording_commits_at_once_then_groups(tmp_path):
     store, now = StoreWriter(tmp_path / "s"), [0.0]
     group = CommitGroup(store, clock=lambda: now[0])
     assert group.due_in_s() is None
-    group.add(0, waiting(store, one(1)))
+    group.add(0, prepared(store, one(1)))
     assert list(group.results) == [0]
     for place in (1, 2, 3):
         now[0] += 1.0
-        group.add(place, waiting(store, one(place + 1)))
+        group.add(place, prepared(store, one(place + 1)))
     assert list(group.results) == [0]
     assert group.due_in_s() == GROUP_S - 3.0
     now[0] = GROUP_S
@@ -71,29 +71,29 @@ def test_the_first_is_committed_at_once_then_groups(tmp_path):
     assert len(shown(tmp_path / "s")) == 4
 
 
-def test_no_more_than_so_many_wait(store, group, tmp_path, monkeypatch):
+def test_full_group_is_committed(store, group, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "MAX_WAITING", 2)
     for place in range(5):
-        group.add(place, waiting(store, one(place + 1)))
+        group.add(place, prepared(store, one(place + 1)))
     assert list(group.results) == [0, 1, 2, 3, 4]
     assert versions(tmp_path / "s") == [3, 3]
 
 
-def test_what_waits_and_is_not_wanted_leaves_no_file(store, group, tmp_path):
-    group.add(0, waiting(store, one(1)))
+def test_discarded_group_leaves_no_files(store, group, tmp_path):
+    group.add(0, prepared(store, one(1)))
     before = files(tmp_path / "s")
-    group.add(1, waiting(store, one(2)))
+    group.add(1, prepared(store, one(2)))
     assert files(tmp_path / "s") > before
     group.discard()
     assert files(tmp_path / "s") == before
     assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
 
 
-def test_one_that_cannot_be_committed_costs_itself_alone(store, group, tmp_path):
-    group.add(0, waiting(store, one(1, "a")))
-    group.add(1, waiting(store, one(2)))
-    group.add(2, waiting(store, one(1, "c"), instead_of="b"))  # which is not there
-    group.add(3, waiting(store, one(3)))
+def test_failed_recording_does_not_affect_its_group(store, group, tmp_path):
+    group.add(0, prepared(store, one(1, "a")))
+    group.add(1, prepared(store, one(2)))
+    group.add(2, prepared(store, one(1, "c"), instead_of="b"))  # an ingest that is not in the store
+    group.add(3, prepared(store, one(3)))
     group.commit()
     assert isinstance(group.results[2], StoreError)
     assert "ingested again or removed in the meantime" in str(group.results[2])
@@ -101,17 +101,17 @@ def test_one_that_cannot_be_committed_costs_itself_alone(store, group, tmp_path)
     assert set(shown(tmp_path / "s")) == kept
 
 
-def test_the_later_ingest_replaces_one_before_it_in_the_group(store, group, tmp_path):
-    group.add(0, waiting(store, one(1)))
-    group.add(1, waiting(store, one(2, "a")))
-    group.add(2, waiting(store, one(2, "b", seed=9)))
+def test_later_ingest_replaces_earlier_one_of_its_group(store, group, tmp_path):
+    group.add(0, prepared(store, one(1)))
+    group.add(1, prepared(store, one(2, "a")))
+    group.add(2, prepared(store, one(2, "b", seed=9)))
     group.commit()
     assert {place: result.version for place, result in group.results.items()} == {0: 1, 1: 2, 2: 3}
     assert set(shown(tmp_path / "s")) == {"0000000000000001-a", "0000000000000002-b"}
 
 
 @pytest.mark.parametrize("repeated", ["refuse", "keep"])
-def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeated):
+def test_repeated_drive_in_group_is_detected(store, group, tmp_path, repeated):
     rows = recording_transitions(2, episodes=5)
     copy = replaced(
         rows,
@@ -121,9 +121,9 @@ def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeat
             "ingest_id": "z",
         },
     )
-    group.add(0, waiting(store, one(1), repeated))
-    group.add(1, waiting(store, (manifest(rows), rows), repeated))
-    group.add(2, waiting(store, (manifest(copy), copy), repeated))
+    group.add(0, prepared(store, one(1), repeated))
+    group.add(1, prepared(store, (manifest(rows), rows), repeated))
+    group.add(2, prepared(store, (manifest(copy), copy), repeated))
     group.commit()
     first, second = group.results[1], group.results[2]
     assert isinstance(first, IngestResult)
@@ -139,7 +139,7 @@ def test_the_same_drive_twice_in_a_group_is_found(store, group, tmp_path, repeat
     assert len(shown(tmp_path / "s")) == (2 if repeated == "refuse" else 3)
 
 
-KILLED = """
+KILLED_PROCESS = """
 import os, signal, sys
 from support.stores import one
 from restock.ingest.pipeline import CommitGroup, IngestResult, Prepared
@@ -170,7 +170,7 @@ group.commit()
 
 
 @pytest.mark.parametrize(
-    ("when", "there"),
+    ("when", "num_committed"),
     one_in(
         2,
         [
@@ -179,29 +179,29 @@ group.commit()
         ],
     ),
 )
-def test_a_killed_process_leaves_whole_groups(tmp_path, when, there):
+def test_killed_process_leaves_complete_groups(tmp_path, when, num_committed):
     place = tmp_path / "s"
-    StoreWriter(place).write(*one(3, "old"))  # one of the second group replaces
+    StoreWriter(place).write(*one(3, "old"))  # a recording of the second group replaces it
     child = subprocess.run(
-        [sys.executable, "-c", KILLED, str(place), when],
+        [sys.executable, "-c", KILLED_PROCESS, str(place), when],
         env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
     )
     assert child.returncode == -signal.SIGKILL
     before = set(shown(place))
     assert before == (
         {f"{number:016x}-b" for number in (1, 2, 3)}
-        if there == 3
+        if num_committed == 3
         else {f"{1:016x}-b", f"{3:016x}-old"}
     )
     store = StoreWriter(place)
     again = CommitGroup(store, clock=lambda: 0.0)
     for number in (1, 2, 3):
         if f"{number:016x}-b" not in before:
-            again.add(number, waiting(store, one(number, "c", seed=number)))
+            again.add(number, prepared(store, one(number, "c", seed=number)))
     again.commit()
     assert [name[:16] for name in sorted(shown(place))] == [f"{n:016x}" for n in (1, 2, 3)]
     manifests = store.files("recordings")
-    assert store.clean() == []  # another writer may be about to commit what lies there
+    assert store.clean() == []  # another writer may be about to commit these files
     assert store.files("recordings") == manifests
     old = time.time() - 3600
     for path in place.rglob("*.parquet"):
@@ -216,8 +216,8 @@ def test_a_killed_process_leaves_whole_groups(tmp_path, when, there):
     assert len(named) == 6
 
 
-def on_a_full_disk(monkeypatch, name: str) -> None:
-    """Let commits to one of the tables fail as Delta's library does on a full disk."""
+def fill_disk(monkeypatch, name: str) -> None:
+    """Make commits to a table fail as Delta's library fails on a full disk."""
     transact = StoreWriter.transact
 
     def full(self, table, actions, *rest):
@@ -230,13 +230,13 @@ def on_a_full_disk(monkeypatch, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", one_in(2, ["transitions", "recordings"]))
-def test_a_commit_on_a_full_disk_leaves_no_file(store, group, tmp_path, monkeypatch, name):
+def test_commit_on_full_disk_leaves_no_files(store, group, tmp_path, monkeypatch, name):
     store.write(*one(1, "old"))
     before, manifests = files(tmp_path / "s"), store.files("recordings")
     with monkeypatch.context() as patched:
-        on_a_full_disk(patched, name)
-        for place in (1, 2, 3):  # the first replaces
-            group.add(place, waiting(store, one(place)))
+        fill_disk(patched, name)
+        for place in (1, 2, 3):  # the first one replaces a recording
+            group.add(place, prepared(store, one(place)))
         group.commit()
         assert len(group.results) == 3
         for result in group.results.values():
@@ -250,12 +250,12 @@ def test_a_commit_on_a_full_disk_leaves_no_file(store, group, tmp_path, monkeypa
     assert store.files("recordings") == manifests
     assert set(shown(tmp_path / "s")) == {f"{1:016x}-old"}
     for place in (1, 2, 3):
-        group.add(place, waiting(store, one(place)))
+        group.add(place, prepared(store, one(place)))
     group.commit()
     assert set(shown(tmp_path / "s")) == {f"{number:016x}-a" for number in (1, 2, 3)}
 
 
-def test_an_interrupt_between_the_tables_leaves_no_file(store, group, tmp_path, monkeypatch):
+def test_interrupt_between_tables_leaves_no_files(store, group, tmp_path, monkeypatch):
     store.write(*one(1))
     before = files(tmp_path / "s")
     commit = StoreWriter.commit
@@ -267,5 +267,5 @@ def test_an_interrupt_between_the_tables_leaves_no_file(store, group, tmp_path, 
 
     monkeypatch.setattr(StoreWriter, "commit", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        group.add(2, waiting(store, one(2)))
+        group.add(2, prepared(store, one(2)))
     assert files(tmp_path / "s") == before

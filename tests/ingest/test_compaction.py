@@ -1,4 +1,4 @@
-"""A store goes on after its files were compacted, and its summaries stay true."""
+"""Compacted stores stay usable, and their summaries stay correct."""
 
 from pathlib import Path
 
@@ -20,8 +20,8 @@ from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.store import Store
 
 
-def compacted_by_delta(path: Path) -> None:
-    """As any tool that knows Delta does it, with the old files gone."""
+def compact_with_delta(path: Path) -> None:
+    """Compact and vacuum with Delta's library, as another tool does."""
     for name in (RECORDINGS, TRANSITIONS):
         table = DeltaTable(str(path / name))
         table.optimize.compact()
@@ -46,7 +46,7 @@ COMMON = (
 )
 
 
-def same_as_scanned(path: Path | str) -> None:
+def assert_views_match_scan(path: Path | str) -> None:
     """Check that the common views agree with views that scan the rows."""
     with Store(path) as store:
         scanned = duckdb.connect()
@@ -68,23 +68,23 @@ def same_as_scanned(path: Path | str) -> None:
 
 
 def rounded(relation: duckdb.DuckDBPyRelation) -> list[tuple[object, ...]]:
-    """Round values, as sums in another order differ in their last digits."""
+    """Return rounded rows, as sums in another order differ in their last digits."""
     return [
         tuple(round(value, 6) if isinstance(value, float) else value for value in row)
         for row in relation.fetchall()
     ]
 
 
-def test_views_over_summaries_are_those_over_rows(writer, tmp_path):
+def test_summary_views_match_row_views(writer, tmp_path):
     writer.write(*one(1, "b", seed=3))
-    same_as_scanned(tmp_path / "s")
-    compacted_by_delta(tmp_path / "s")
+    assert_views_match_scan(tmp_path / "s")
+    compact_with_delta(tmp_path / "s")
     writer.write(*one(2, "c", seed=5))
-    assert compact(writer).summaries == 1  # nobody knows what the other tool did to its rows
-    same_as_scanned(tmp_path / "s")
+    assert compact(writer).summaries == 1  # the other tool's changes of its rows are unknown
+    assert_views_match_scan(tmp_path / "s")
 
 
-def test_compaction_is_advised_of_many_files_of_few_rows(tmp_path):
+def test_audit_advises_compaction_of_many_small_files(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2), one(3)])
     audits = [audit for audit in shipped_audits() if audit.name == "many_small_files"]
@@ -101,20 +101,24 @@ def test_compaction_is_advised_of_many_files_of_few_rows(tmp_path):
 
 
 @pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
-def test_a_compacted_store_goes_on(place):
+def test_compacted_store_accepts_writes_and_compactions(place):
     writer = StoreWriter(place)
     version = writer.write_all([one(1), one(2), one(3)])
     as_written = writer.rows(f"{2:016x}", f"{2:016x}-a")
-    done = compact(writer)
-    assert (done.files_before, done.files_after, done.manifests_after) == (3, 1, 1)
-    assert done.rows == sum(shown(place).values())
-    # Replaced, added, compacted again: and each row as its ingest wrote it.
+    compaction = compact(writer)
+    assert (compaction.files_before, compaction.files_after, compaction.manifests_after) == (
+        3,
+        1,
+        1,
+    )
+    assert compaction.rows == sum(shown(place).values())
+    # Rows stay as ingested after replacing, adding and compacting again.
     writer.write(*one(2, "b", seed=7))
     writer.write(*one(4))
     assert compact(writer).files_after == 1
     assert writer.clean(retention_hours=24) == []
     assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(place))
-    with Store(place, version=version) as store:  # as it was before all that
+    with Store(place, version=version) as store:  # the version before compaction
         counts = store.sql("SELECT ingest_id, count(*) FROM transitions GROUP BY ALL").fetchall()
     assert dict(counts) == {f"{n:016x}-a": len(one(n)[1]) for n in (1, 2, 3)}
     writer.clean(retention_hours=0)
@@ -125,7 +129,7 @@ def test_a_compacted_store_goes_on(place):
     assert writer.repeated(writer.stage(manifest(copy), copy), 0.2) is not None
 
 
-def test_nothing_is_left_to_compact_and_a_dry_run_writes_nothing(writer, tmp_path, capsys, shell):
+def test_dry_run_writes_nothing_and_second_run_has_no_work(writer, tmp_path, capsys, shell):
     files, command = sorted((tmp_path / "s").rglob("*")), ["store", "compact", str(tmp_path / "s")]
     assert main([*command, "--dry-run"]) == 0
     assert sorted((tmp_path / "s").rglob("*")) == files
@@ -142,18 +146,18 @@ def test_nothing_is_left_to_compact_and_a_dry_run_writes_nothing(writer, tmp_pat
 
 @pytest.mark.long
 @pytest.mark.parametrize("recording", [1, 3])
-def test_an_ingest_while_it_compacts_loses_nothing(writer, tmp_path, before_commit, recording):
-    """One that replaces a recording undoes the step; one that adds another does not."""
+def test_concurrent_ingest_during_compaction(writer, tmp_path, before_commit, recording):
+    """A replacing ingest undoes the compaction step; an added recording does not."""
     again = one(recording, "b", seed=8)
     before_commit(lambda: StoreWriter(tmp_path / "s").write(*again), TRANSITIONS)
-    done = compact(writer)
-    assert done.changed_meanwhile == (2 if recording == 1 else 0)
+    compaction = compact(writer)
+    assert compaction.changed_meanwhile == (2 if recording == 1 else 0)
     assert shown(tmp_path / "s")[f"{recording:016x}-b"] == len(again[1])
     assert len(shown(tmp_path / "s")) == (2 if recording == 1 else 3)
-    same_as_scanned(tmp_path / "s")
+    assert_views_match_scan(tmp_path / "s")
 
 
-def test_a_faster_compaction_undoes_no_replacing_ingest(writer, tmp_path, before_commit):
+def test_concurrent_compaction_keeps_replacing_ingest(writer, tmp_path, before_commit):
     before_commit(lambda: compact(StoreWriter(tmp_path / "s")), TRANSITIONS)
     writer.write(*one(1, "b", seed=8))
     assert shown(tmp_path / "s") == {
@@ -162,8 +166,8 @@ def test_a_faster_compaction_undoes_no_replacing_ingest(writer, tmp_path, before
     }
 
 
-def test_the_ends_of_episodes_outlive_compaction(tmp_path):
-    """Of several recordings, one of which has none."""
+def test_episode_ends_survive_compaction(tmp_path):
+    """One of two recordings has episode ends."""
     writer = StoreWriter(tmp_path / "s")
     ends = pa.table({"episode_index": [0, 1], "step_index": [7, 9]})
     manifest, rows = one(1)
@@ -175,8 +179,8 @@ def test_the_ends_of_episodes_outlive_compaction(tmp_path):
         assert list(store.episode_ends([f"{2:016x}"])) == []
 
 
-def test_without_restock_each_row_is_read_once(writer, tmp_path):
-    """As docs/libraries.md says."""
+def test_other_tools_read_each_row_once(writer, tmp_path):
+    """Check the way to read a store that docs/libraries.md gives."""
     writer.write(*one(2, "b"))
     compact(writer)
     place = str(tmp_path / "s" / TRANSITIONS)
@@ -185,20 +189,24 @@ def test_without_restock_each_row_is_read_once(writer, tmp_path):
     assert len(duckdb.read_parquet(f"{place}/**/*.parquet")) > 2 * count
 
 
-def parquet(path: Path) -> list[Path]:
+def parquet_files(path: Path) -> list[Path]:
     return sorted(path.rglob("*.parquet"))
 
 
 @pytest.mark.parametrize("name", [RECORDINGS, TRANSITIONS])
 @pytest.mark.parametrize("committed", [False, True])
-def test_an_interrupted_compaction_leaves_no_orphan(writer, tmp_path, monkeypatch, name, committed):
-    before, whole, transact = parquet(tmp_path / "s"), shown(tmp_path / "s"), StoreWriter.transact
+def test_interrupted_compaction_leaves_no_orphan(writer, tmp_path, monkeypatch, name, committed):
+    before, whole, transact = (
+        parquet_files(tmp_path / "s"),
+        shown(tmp_path / "s"),
+        StoreWriter.transact,
+    )
 
     def interrupted(self, table, actions, turns, operation=OPERATION):
-        at_it = table.table_uri.rstrip("/").endswith(name)
-        if committed or not at_it:
+        is_target = table.table_uri.rstrip("/").endswith(name)
+        if committed or not is_target:
             transact(self, table, actions, turns, operation)
-        if at_it:
+        if is_target:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(StoreWriter, "transact", interrupted)
@@ -209,38 +217,38 @@ def test_an_interrupted_compaction_leaves_no_orphan(writer, tmp_path, monkeypatc
         for table in (RECORDINGS, TRANSITIONS)
         for file in writer.files(table)
     }
-    assert set(parquet(tmp_path / "s")) == set(before) | held
+    assert set(parquet_files(tmp_path / "s")) == set(before) | held
     assert shown(tmp_path / "s") == whole
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 @pytest.mark.parametrize("name", [RECORDINGS, TRANSITIONS])
-def test_a_write_that_fails_leaves_no_part_of_a_file(writer, tmp_path, monkeypatch, name, error):
+def test_failed_write_leaves_no_partial_file(writer, tmp_path, monkeypatch, name, error):
     if name == TRANSITIONS:
         fold(writer)
-    before, write = parquet(tmp_path / "s"), pq.ParquetWriter.write_table
+    before, write = parquet_files(tmp_path / "s"), pq.ParquetWriter.write_table
 
-    def full(self, table, **given):
-        write(self, table, **given)
+    def write_and_fail(self, table, **options):
+        write(self, table, **options)
         raise error
 
-    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", write_and_fail)
     with pytest.raises(StoreError if isinstance(error, OSError) else KeyboardInterrupt):
         compact(writer)
-    assert parquet(tmp_path / "s") == before
+    assert parquet_files(tmp_path / "s") == before
 
 
-def test_one_ingest_after_the_other_leaves_few_manifests(tmp_path, monkeypatch):
-    """Each is written again a few times only; a reader that was open sees all that follow."""
+def test_successive_ingests_leave_few_manifests(tmp_path, monkeypatch):
+    """Each manifest is rewritten a few times only, and an open reader sees all later ones."""
     monkeypatch.setattr(writer_module, "FOLD_FILES", 2)
     writer, reader, merge, written = StoreWriter(tmp_path / "s"), None, writer_module.merge, []
 
-    def counted(*args, **given):
-        made = merge(*args, **given)
-        written.append(made.rows)
-        return made
+    def merge_and_count(*args, **options):
+        merged = merge(*args, **options)
+        written.append(merged.rows)
+        return merged
 
-    monkeypatch.setattr(writer_module, "merge", counted)
+    monkeypatch.setattr(writer_module, "merge", merge_and_count)
     for recording in range(1, 9):
         writer.write_all([one(recording)])
         fold_if_many(writer)

@@ -1,4 +1,4 @@
-"""Conditions and exposures: what they say of a step, how surely, and what is refused."""
+"""Conditions and exposures: their labels, their probabilities, and rejected definitions."""
 
 import shutil
 from pathlib import Path
@@ -37,7 +37,7 @@ SHIPPED = list(shipped().values())
 
 
 def steps(count: int, **signals: object) -> pa.Table:
-    """Return an episode of a robot at .5 m/s with nothing near, but for these signals."""
+    """Return an episode of a robot at 0.5 m/s in free space, except for these signals."""
     usual = {
         "stamp_ns": np.arange(count) * 200_000_000,
         "pose_stamp_ns": np.arange(count) * 200_000_000,
@@ -60,45 +60,49 @@ def steps(count: int, **signals: object) -> pa.Table:
     return pa.table({"episode_index": np.zeros(count, np.int32), "step_index": index, **columns})
 
 
-def changed(value: float, usual: float, count: int, at: slice) -> np.ndarray:
-    """Return a column (N,) of one value, and of another at some steps."""
+def with_value_at(value: float, usual: float, count: int, at: slice) -> np.ndarray:
+    """Return a column (N,) of `usual`, with `value` at some steps."""
     column = np.full(count, usual)
     column[at] = value
     return column
 
 
-def given_to(table: pa.Table, name: str, constants: dict[str, float] | None = None) -> list[int]:
-    """Return the rows that a shipped condition or exposure holds at, by constants of a robot."""
-    made = (shipped(constants) | shipped(constants, "exposure"))[name]
-    return np.flatnonzero(label(table, [made])[name]).tolist()
+def labelled_rows(
+    table: pa.Table, name: str, constants: dict[str, float] | None = None
+) -> list[int]:
+    """Return the rows that a shipped condition or exposure labels, given constants of a robot."""
+    found = (shipped(constants) | shipped(constants, "exposure"))[name]
+    return np.flatnonzero(label(table, [found])[name]).tolist()
 
 
-def test_nothing_is_labelled_where_nothing_happens():
+def test_uneventful_steps_are_nominal():
     labels = label(steps(20), SHIPPED)
     assert set(labels) == {"recovery", "near_collision", "wheel_slip", "blocked_aisle"}
-    assert not any(given.any() for given in labels.values())
+    assert not any(holds.any() for holds in labels.values())
     assert primary(labels, SHIPPED) == ["nominal"] * 20
 
 
-def test_wheels_that_turn_faster_than_the_robot_goes_slip():
-    table = steps(20, wheel_speed_mps=changed(1.2, 0.5, 20, slice(8, 12)))
-    found = given_to(table, "wheel_slip")
+def test_wheels_faster_than_robot_are_slip():
+    table = steps(20, wheel_speed_mps=with_value_at(1.2, 0.5, 20, slice(8, 12)))
+    found = labelled_rows(table, "wheel_slip")
     assert set(range(8, 12)) <= set(found) <= set(range(7, 13))
 
 
-def test_a_spin_that_the_gyroscope_does_not_feel_is_slip():
-    table = steps(20, wheel_yaw_rate_radps=changed(1.0, 0.0, 20, slice(8, 12)))
-    assert {8, 9, 10} <= set(given_to(table, "wheel_slip")) <= set(range(7, 13))
+def test_wheel_spin_unseen_by_gyro_is_slip():
+    table = steps(20, wheel_yaw_rate_radps=with_value_at(1.0, 0.0, 20, slice(8, 12)))
+    assert {8, 9, 10} <= set(labelled_rows(table, "wheel_slip")) <= set(range(7, 13))
 
 
-def test_a_bump_makes_the_step_before_it_a_near_collision():
+def test_step_before_bump_is_near_collision():
     bumped = np.zeros(20, np.bool_)
     bumped[9] = True
-    assert given_to(steps(20, bumped=bumped), "near_collision") == [8]
+    assert labelled_rows(steps(20, bumped=bumped), "near_collision") == [8]
 
 
-def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float = 0.0) -> pa.Table:
-    """Return steps of a robot that sees something this far ahead, and what came nearer."""
+def with_obstacle(
+    drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float = 0.0
+) -> pa.Table:
+    """Return steps of a robot that sees an obstacle this far ahead, and how much it came nearer."""
     seen = np.where(ahead < 2.2, ahead, 4.0)
     driven = np.concatenate([[0.0], drive["wheel_speed_mps"][:-1] * 0.2])
     came = np.concatenate([[0.0], ahead[:-1] - ahead[1:]]) - driven
@@ -114,36 +118,36 @@ def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float =
 
 
 @pytest.mark.parametrize("planned", [True, False])
-def test_only_an_obstacle_that_stays_blocks_an_aisle(planned):
-    speed = np.where(np.arange(60) < 20, 0.9, 0.0)  # up to a pallet, and stop before it
+def test_only_standing_obstacle_blocks_aisle(planned):
+    speed = np.where(np.arange(60) < 20, 0.9, 0.0)  # drive up to a pallet and stop before it
     x = np.concatenate([[0.0], np.cumsum(speed * 0.2)[:-1]])
     drive = {
         "pose_x_m": x,
         "wheel_speed_mps": speed,
         "route_remaining_m": 9.0 - x if planned else np.zeros(60),
     }
-    passing = in_the_way(drive, changed(0.8, 4.0, 60, slice(8, 9)))
-    assert given_to(passing, "blocked_aisle") == []
-    found = given_to(in_the_way(drive, 4.5 - x), "blocked_aisle")
+    passing = with_obstacle(drive, with_value_at(0.8, 4.0, 60, slice(8, 9)))
+    assert labelled_rows(passing, "blocked_aisle") == []
+    found = labelled_rows(with_obstacle(drive, 4.5 - x), "blocked_aisle")
     assert {22, 30, 50, 59} <= set(found)
     assert found[0] >= 14  # 1.9 m before it
-    corner = in_the_way(drive, 4.5 - x, aside_m=0.22)  # of a rack, which the plan passes
-    assert given_to(corner, "blocked_aisle") == []
-    # Somebody walks up to the robot as fast as it drives, stands there, and is away after a while.
+    corner = with_obstacle(drive, 4.5 - x, aside_m=0.22)  # a rack's corner, which the plan passes
+    assert labelled_rows(corner, "blocked_aisle") == []
+    # A person walks up to the robot as fast as it drives, stands there, and later leaves.
     ahead = np.concatenate([np.linspace(4, 0.6, 10), np.full(15, 0.6), np.full(35, 4.0)])
-    assert given_to(in_the_way(drive, ahead), "blocked_aisle") == []
+    assert labelled_rows(with_obstacle(drive, ahead), "blocked_aisle") == []
 
 
-def test_recovery_lasts_until_there_is_room_again():
+def test_recovery_lasts_until_clearance_returns():
     table = steps(30, clearance_m=np.array([2.0] * 10 + [0.1] * 3 + [0.2] * 4 + [0.5] * 13))
-    found = given_to(table, "recovery")
+    found = labelled_rows(table, "recovery")
     assert set(range(11, 16)) <= set(found)
     assert found[0] >= 10
     assert found[-1] <= 17
     assert found == list(range(found[0], found[-1] + 1))
 
 
-SMALL = {  # of a robot of .2 m/s that is .15 m wide, and decides ten times a second
+SMALL = {  # a robot of 0.2 m/s, 0.15 m wide, with ten decisions a second
     "tight_clearance_m": 0.05,
     "body_width_m": 0.15,
     "slip_limit_mps": 0.03,
@@ -152,48 +156,57 @@ SMALL = {  # of a robot of .2 m/s that is .15 m wide, and decides ten times a se
 }
 
 
-def test_the_default_limits_are_those_of_the_stand_in():
+def test_default_limits_equal_stand_in_limits():
     assert load_profile("warehouse_amr").task.condition_limits == STAND_IN_LIMITS
 
 
-def test_how_near_is_near_follows_the_robot():
+def test_clearance_limits_follow_robot():
     table = steps(30, clearance_m=np.array([2.0] * 10 + [0.1] * 3 + [0.2] * 4 + [0.5] * 13))
     small = Noise().constants | SMALL
-    assert given_to(table, "near_collision")
-    assert given_to(table, "near_collision", small) == given_to(table, "recovery", small) == []
+    assert labelled_rows(table, "near_collision")
+    assert (
+        labelled_rows(table, "near_collision", small)
+        == labelled_rows(table, "recovery", small)
+        == []
+    )
     nearer = steps(30, clearance_m=np.array([2.0] * 10 + [0.02] * 3 + [0.2] * 17))
-    assert {9, 10, 11} <= set(given_to(nearer, "near_collision", small)) <= set(range(8, 13))
-    assert given_to(nearer, "recovery", small)[-1] <= 13  # there is room again at .1 m
+    assert {9, 10, 11} <= set(labelled_rows(nearer, "near_collision", small)) <= set(range(8, 13))
+    assert labelled_rows(nearer, "recovery", small)[-1] <= 13  # 0.1 m is enough room for this robot
 
 
 def test_slip_limit_follows_robot_and_localiser_noise():
-    table = steps(60, wheel_speed_mps=changed(0.58, 0.5, 60, slice(20, 40)))
-    assert given_to(table, "wheel_slip") == []
+    table = steps(60, wheel_speed_mps=with_value_at(0.58, 0.5, 60, slice(20, 40)))
+    assert labelled_rows(table, "wheel_slip") == []
     small = Noise().constants | SMALL
-    assert set(range(20, 30)) <= set(given_to(table, "wheel_slip", small)) <= set(range(5, 40))
-    floor = given_to(table, "slippery_floor", small)
-    assert floor[0] >= 20  # not before
+    assert set(range(20, 30)) <= set(labelled_rows(table, "wheel_slip", small)) <= set(range(5, 40))
+    floor = labelled_rows(table, "slippery_floor", small)
+    assert floor[0] >= 20  # not earlier
     assert set(range(30, 40)) <= set(floor) <= set(range(20, 55))
-    noisy = Noise(localiser_m=0.05).constants | SMALL  # two such poses differ by as much
-    assert given_to(table, "wheel_slip", noisy) == given_to(table, "slippery_floor", noisy) == []
+    # the difference of two such poses has as much noise
+    noisy = Noise(localiser_m=0.05).constants | SMALL
+    assert (
+        labelled_rows(table, "wheel_slip", noisy)
+        == labelled_rows(table, "slippery_floor", noisy)
+        == []
+    )
 
 
-def test_times_are_in_steps_of_the_robot():
-    came = changed(0.3, 0.0, 40, slice(8, 9))
-    for period_s, last in ((0.2, 16), (0.1, 26), (0.5, 11), (3.0, 9)):  # .8 s and 1 s, in steps
+def test_durations_follow_control_period():
+    came = with_value_at(0.3, 0.0, 40, slice(8, 9))
+    for period_s, last in ((0.2, 16), (0.1, 26), (0.5, 11), (3.0, 9)):  # 0.8 s and 1 s, in steps
         task = Noise().constants | SMALL | {"control_period_s": period_s}
-        held = given_to(steps(40, came_nearer_m=came), "closing_traffic", task)
+        held = labelled_rows(steps(40, came_nearer_m=came), "closing_traffic", task)
         assert held == list(range(8, last + 1))
 
 
 @pytest.mark.parametrize("period_s", [0.2, 0.1, 0.05])
-def test_who_walks_up_is_seen_whatever_the_control_period(period_s: float):
+def test_approach_is_detected_at_any_control_period(period_s: float):
     robot = Noise().constants | STAND_IN_LIMITS | {"control_period_s": period_s}
     begins, ends = round(4 / period_s), round(6 / period_s)
-    for walks_mps, seen in ((0.5, True), (0.1, False)):  # .1 m/s: the noise of two ranges
-        came = changed(walks_mps * period_s, 0.0, 2 * ends, slice(begins, ends))
-        held = given_to(steps(2 * ends, came_nearer_m=came), "closing_traffic", robot)
-        if seen:
+    for walks_mps, detected in ((0.5, True), (0.1, False)):  # 0.1 m/s is the noise of two ranges
+        came = with_value_at(walks_mps * period_s, 0.0, 2 * ends, slice(begins, ends))
+        held = labelled_rows(steps(2 * ends, came_nearer_m=came), "closing_traffic", robot)
+        if detected:
             assert begins <= held[0] <= begins + 0.5 / period_s
             assert set(range(held[0], ends)) <= set(held)
         else:
@@ -226,8 +239,8 @@ def tables(draw: st.DrawFn) -> pa.Table:
 
 @settings(max_examples=15)
 @given(tables(), st.data())
-def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
-    """Steps after t are exchanged for others: the labels of the steps up to t stay."""
+def test_pre_condition_ignores_later_steps(table, data):
+    """Replacing the steps after t keeps the labels up to t."""
     until = data.draw(st.integers(0, len(table) - 1))
     other = data.draw(tables())
     future = other.slice(0, max(len(other) - 1, 1))
@@ -249,29 +262,29 @@ def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
 
 @settings(max_examples=10)
 @given(tables(), tables())
-def test_episodes_do_not_see_each_other(first, second):
+def test_episodes_are_labelled_independently(first, second):
     index = first.column_names.index("episode_index")
     other = second.set_column(index, "episode_index", pa.array(np.ones(len(second), np.int32)))
     both = label(pa.concat_tables([first, other]), SHIPPED)
     alone = label(first, SHIPPED)
-    for name, given_ in alone.items():
-        assert np.array_equal(both[name][: len(first)], given_), name
+    for name, holds in alone.items():
+        assert np.array_equal(both[name][: len(first)], holds), name
 
 
-def test_labels_are_in_the_order_of_the_rows():
+def test_labels_keep_row_order():
     table = steps(6, bumped=np.array([False, False, True, False, False, False]))
     shuffled = table.take([5, 1, 0, 3, 2, 4])
     found = label(shuffled, [shipped()["near_collision"]])["near_collision"]
     assert np.flatnonzero(found).tolist() == [1]
 
 
-def test_the_lowest_priority_number_names_the_row():
+def test_lowest_priority_number_is_primary_condition():
     low, high = Condition("a", "pre", "true", priority=1), Condition("b", "pre", "true")
     labels = label(steps(2), [high, low])
     assert primary(labels, [high, low]) == ["a", "a"]
 
 
-def test_a_condition_that_does_not_run_is_named():
+def test_failing_condition_is_reported_by_name():
     good, bad = Condition("good", "pre", "true"), Condition("bad", "pre", "clearance_mm < 1")
     with pytest.raises(ConfigError) as error:
         label(steps(3), [good, bad])
@@ -279,17 +292,17 @@ def test_a_condition_that_does_not_run_is_named():
     assert "clearance_m" in str(error.value)
 
 
-def doubled(times: int) -> dict[str, str]:
-    """Return a text that gets twice as long with each name."""
+def doubling_let(times: int) -> dict[str, str]:
+    """Return `let` entries whose text doubles in length with each name."""
     first = {"text_0": "'x' || clearance_m::VARCHAR"}
     return first | {f"text_{n + 1}": f"text_{n} || text_{n}" for n in range(times)}
 
 
-def test_a_condition_that_takes_too_long_is_stopped_and_named(monkeypatch):
+def test_slow_condition_is_stopped_and_reported(monkeypatch):
     monkeypatch.setattr(conditions, "LIMIT_S", 0.1)
     monkeypatch.setattr(conditions, "LIMIT_S_PER_STEP", 0.0)
     sql = "length(regexp_replace(text_11, '[0-9]+', 'y', 'g')) < 0"
-    slow = Condition("slow", "pre", sql, let=doubled(11))
+    slow = Condition("slow", "pre", sql, let=doubling_let(11))
     with pytest.raises(
         ConfigError, match=r"condition 'slow': its SQL takes too long.* 5,000 steps"
     ):
@@ -299,13 +312,13 @@ def test_a_condition_that_takes_too_long_is_stopped_and_named(monkeypatch):
 
 
 @pytest.mark.long
-def test_a_condition_that_takes_too_much_memory_is_named():
-    large = Condition("large", "pre", "length(text_26) > 1", let=doubled(26))
+def test_memory_hungry_condition_is_reported():
+    large = Condition("large", "pre", "length(text_26) > 1", let=doubling_let(26))
     with pytest.raises(ConfigError, match=r"condition 'large': its SQL takes more memory .*1GB"):
         label(steps(200), [Condition("good", "pre", "true"), large])
 
 
-REFUSED = {
+REJECTED_SQL = {
     "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it contains a query",
     "read_text('/etc/passwd') IS NULL": "fails on the steps",
     "user = 'x'": "reads data other than the steps",
@@ -333,13 +346,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("sql", REFUSED)
-def test_what_a_stranger_might_write_in_a_condition(sql, tmp_path, monkeypatch):
-    """No files, no other tables, no settings, no clock, no chance, no look ahead under `pre`."""
+@pytest.mark.parametrize("sql", REJECTED_SQL)
+def test_unsafe_condition_sql_is_rejected(sql, tmp_path, monkeypatch):
+    """Conditions read no files, tables, settings, clock or randomness; `pre` never looks ahead."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="condition 'x'") as error:
         label(steps(3), [Condition("x", "pre", sql)])
-    assert REFUSED[sql] in str(error.value)
+    assert REJECTED_SQL[sql] in str(error.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -354,22 +367,22 @@ def test_what_a_stranger_might_write_in_a_condition(sql, tmp_path, monkeypatch):
         "list_filter([clearance_m], lambda x: x > 1)[1] > 1",
     ],
 )
-def test_what_a_condition_may_say(sql):
+def test_valid_condition_sql_is_accepted(sql):
     assert label(steps(3), [Condition("x", "pre", sql)])["x"].any()
 
 
 @pytest.mark.parametrize("name", ['a" FROM steps; --', "nominal", "", "a b", "1a"])
-def test_a_condition_has_a_plain_name(name):
+def test_invalid_condition_name_is_rejected(name):
     with pytest.raises(ValueError, match="letters, digits and _"):
         Condition(name, "pre", "true")
 
 
-def test_null_is_false():
+def test_null_label_is_false():
     found = label(steps(3), [Condition("n", "post", "lead(bumped) OVER episode")])["n"]
     assert found.tolist() == [False, False, False]
 
 
-def test_what_a_rule_goes_by_can_be_looked_at():
+def test_let_values_of_condition():
     rule = Condition(
         name="fast",
         timing="pre",
@@ -379,7 +392,7 @@ def test_what_a_rule_goes_by_can_be_looked_at():
     )
     table = steps(3, wheel_speed_mps=np.array([0.0, 0.5, 0.25]))
     found = let_values(table, rule)["change_mps"]
-    assert np.isnan(found[0])  # null: there is no step before
+    assert np.isnan(found[0])  # null: the first step has no previous one
     assert found[1:].tolist() == [0.5, -0.25]
     with pytest.raises(ConfigError, match=r"VARCHAR|string"):
         let_values(table, Condition(name="text", timing="pre", sql="true", let={"word": "'a'"}))
@@ -405,27 +418,29 @@ def condition(text: str = FILE, noise_m: float = 0.1) -> Condition:
     return made.with_constants(Noise(lidar_m=noise_m).constants)
 
 
-def test_parts_of_a_condition_file():
+def test_condition_file_parts():
     fast = condition()
     assert (fast.doc, fast.timing, fast.priority) == ("Fast, for a while.", "pre", 35)
     assert list(fast.let) == ["over_mps", "smooth_mps"]
-    assert fast.constants == {"lidar_noise_m": 0.1}  # what it names, and no more
+    assert fast.constants == {"lidar_noise_m": 0.1}  # only the constants that it uses
     table = steps(5, wheel_speed_mps=np.array([0.5, 0.7, 0.1, 0.9, 0.9]))
     assert label(table, [fast])["fast"].tolist() == [False, True, False, False, True]
-    given = probabilities(table, [fast])["fast"]
-    assert np.isnan(given[0])
-    np.testing.assert_allclose(given[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
-    near = uncertain_steps({"fast": given}, [fast])["fast"]
-    assert near.tolist() == [False, False, True, True, False]
+    probability = probabilities(table, [fast])["fast"]
+    assert np.isnan(probability[0])
+    np.testing.assert_allclose(probability[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
+    uncertain = uncertain_steps({"fast": probability}, [fast])["fast"]
+    assert uncertain.tolist() == [False, False, True, True, False]
 
 
-def test_more_noise_makes_a_probability_less_sure():
+def test_more_noise_makes_probability_less_certain():
     table = steps(3, wheel_speed_mps=np.array([0.5, 0.7, 0.9]))
-    sure, unsure = (probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5))
-    assert sure > 0.95 > unsure > 0.5
+    certain, uncertain = (
+        probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5)
+    )
+    assert certain > 0.95 > uncertain > 0.5
 
 
-def test_the_version_of_labels_follows_what_can_change_them():
+def test_labels_version_follows_rule_and_constants():
     plain = Condition("fast", "pre", "wheel_speed_mps > 1")
     assert labels_version([plain]) == labels_version([plain.with_constants(Noise().constants)])
     versions = {
@@ -437,7 +452,7 @@ def test_the_version_of_labels_follows_what_can_change_them():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"), "'over_mps"),
         (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is already used"),
@@ -447,17 +462,19 @@ def test_the_version_of_labels_follows_what_can_change_them():
         (FILE.replace("1 / (1 +", "1 / ((SELECT 1) +"), "contains a query"),
     ],
 )
-def test_a_probability_keeps_the_rules_of_a_label(text, said):
-    with pytest.raises(ConfigError, match=said):
+def test_invalid_probability_sql_is_rejected(text, message):
+    with pytest.raises(ConfigError, match=message):
         probabilities(steps(3), [condition(text)])
 
 
-def test_noise_of_a_profile_does_not_change_rows():
+def test_noise_changes_labels_version_but_not_hash():
     usual = parse_profile(WAREHOUSE, where="a")
     noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")
     assert usual.hash == noisy.hash
     assert usual.labels_version != noisy.labels_version
-    near = next(one for one in noisy.conditions if one.name == "near_collision")
+    near = next(
+        condition_ for condition_ in noisy.conditions if condition_.name == "near_collision"
+    )
     assert near.constants == {"lidar_noise_m": 0.05, "tight_clearance_m": 0.15}
     carried = parse_profile(profile_toml(noisy), where="its text")
     assert carried.labels_version == noisy.labels_version
@@ -476,7 +493,7 @@ min(clearance_m) OVER (episode ROWS BETWEEN {{{0}}} PRECEDING AND CURRENT ROW)
 '''
 
 
-def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
+def test_own_condition_uses_limits_and_durations() -> None:
     profile = parse_profile(WAREHOUSE + OWN.format("1 s"), where="here")
     tight = profile.conditions[-1]
     assert "ROWS BETWEEN 5 PRECEDING" in tight.sql
@@ -487,21 +504,21 @@ def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
         parse_profile(WAREHOUSE + OWN.format("1 min"), where="here")
 
 
-def test_probabilities_stand_beside_how_often_they_are_true(tmp_path):
+def test_label_reliability_compares_with_truth(tmp_path):
     table = recording_transitions(1)
     truth = ["recovery" if row % 3 else "nominal" for row in range(len(table))]
     path = write_store(tmp_path / "store", [replaced(table, {"true_condition": truth})])
     rows = [dict(row).get("recovery") for row in table["probabilities"].to_pylist()]
-    want: dict[float, list[bool]] = {}
-    for told, true in zip(rows, truth, strict=True):
-        if told is not None:
-            want.setdefault(min(int(told * 10), 9) / 10, []).append(true == "recovery")
+    expected: dict[float, list[bool]] = {}
+    for probability, actual in zip(rows, truth, strict=True):
+        if probability is not None:
+            expected.setdefault(min(int(probability * 10), 9) / 10, []).append(actual == "recovery")
     with Store(path) as store:
         found = store.sql("SELECT from_probability, known, true_share FROM label_reliability")
         for tenth, known, share in found.fetchall():
-            held = want.pop(tenth)
+            held = expected.pop(tenth)
             assert (known, share) == (len(held), pytest.approx(np.mean(held)))
-    assert not want
+    assert not expected
 
 
 LISTED = 'exposures = ["closing_traffic", "plan_blocked", "slippery_floor"]'
@@ -515,25 +532,25 @@ sql = "pose_x_m > 2"
 """
 
 
-def test_each_situation_is_told_by_what_is_known_before_acting():
-    assert given_to(steps(20), "closing_traffic") == []
-    someone = steps(20, came_nearer_m=changed(0.1, 0.0, 20, slice(8, 10)))
-    assert given_to(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
+def test_shipped_exposures_of_typical_steps():
+    assert labelled_rows(steps(20), "closing_traffic") == []
+    person = steps(20, came_nearer_m=with_value_at(0.1, 0.0, 20, slice(8, 10)))
+    assert labelled_rows(person, "closing_traffic") == [9, 10, 11, *range(12, 17)]
     noise = steps(20, came_nearer_m=np.full(20, 0.03))
-    assert given_to(noise, "closing_traffic") == []
-    pallet = {"plan_return_m": changed(1.5, 4.0, 20, slice(5, 15))}
-    assert given_to(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
-    walker = {"came_nearer_m": changed(0.15, 0.0, 20, slice(3, 5))}
-    assert given_to(steps(20, **pallet, **walker), "plan_blocked") == []
-    ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, 20, slice(10, 12)))
-    assert given_to(ice, "slippery_floor") == list(range(11, 17))
-    assert given_to(steps(20), "slippery_floor") == []
+    assert labelled_rows(noise, "closing_traffic") == []
+    pallet = {"plan_return_m": with_value_at(1.5, 4.0, 20, slice(5, 15))}
+    assert labelled_rows(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
+    walker = {"came_nearer_m": with_value_at(0.15, 0.0, 20, slice(3, 5))}
+    assert labelled_rows(steps(20, **pallet, **walker), "plan_blocked") == []
+    ice = steps(20, wheel_speed_mps=with_value_at(1.0, 0.5, 20, slice(10, 12)))
+    assert labelled_rows(ice, "slippery_floor") == list(range(11, 17))
+    assert labelled_rows(steps(20), "slippery_floor") == []
 
 
-def test_an_exposure_takes_no_row_from_a_condition():
+def test_exposure_is_never_primary_condition():
     first = Condition("busy", "pre", "true", priority=0, kind="exposure")
     every = [*SHIPPED, first]
-    table = steps(20, clearance_m=changed(0.05, 2.0, 20, slice(8, 10)))
+    table = steps(20, clearance_m=with_value_at(0.05, 2.0, 20, slice(8, 10)))
     labels = label(table, every)
     assert labels["busy"].all()
     named = primary(labels, every)
@@ -557,7 +574,7 @@ def profile(store: Path) -> Path:
     return store.parent / "amr.toml"
 
 
-def test_a_store_lists_exposures_beside_its_conditions(store, profile):
+def test_store_lists_exposures_apart_from_conditions(store, profile):
     with Store(store) as opened:
         assert [one.name for one in opened.exposures()] == ["closing_traffic", "far_out"]
         assert "far_out" not in {one.name for one in opened.conditions()}
@@ -580,7 +597,7 @@ def test_a_store_lists_exposures_beside_its_conditions(store, profile):
     assert again.labels_version == load_profile(profile).labels_version
 
 
-def test_changed_exposures_are_told_again_from_the_store(store, profile, tmp_path):
+def test_relabelling_applies_changed_exposures(store, profile, tmp_path):
     store, text = shutil.copytree(store, tmp_path / "store"), profile.read_text()
     profile = tmp_path / "amr.toml"
     profile.write_text(text.replace("pose_x_m > 2", "pose_x_m > 2.2"))

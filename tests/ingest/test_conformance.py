@@ -1,4 +1,4 @@
-"""MCAP's own conformance suite: every record of every file, as its JSON lists them."""
+"""MCAP's conformance suite: every record of every file matches its JSON."""
 
 import json
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is a
 
 FILES = sorted((SHARED / "mcap-conformance").rglob("*.mcap"))
 KINDS = {op: "".join(word.capitalize() for word in op.name.split("_")) for op in Op}
-SPANS = ("data", "records")  # fields that are places in the file
+SPANS = ("data", "records")  # fields that are byte ranges of the file
 
 
 def expected(file: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -25,7 +25,7 @@ def expected(file: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def written(content: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the records of a file as our parser reads them, those of chunks in their place."""
+    """Yield the records of a file as our parser reads them, chunk contents in place."""
     for opcode, start, stop in walk(content, len(MAGIC), len(content) - len(MAGIC)):
         record = parse(Op(opcode), content, start, stop)
         if opcode == Op.CHUNK:
@@ -36,12 +36,12 @@ def written(content: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
             data = inflate(chunk, content[chunk.start : chunk.stop])
             for inner, at, end in walk(data, 0, len(data)):
                 yield KINDS[Op(inner)], plain(parse(Op(inner), data, at, end), data)
-        elif opcode != Op.MESSAGE_INDEX:  # which the JSON leaves out
+        elif opcode != Op.MESSAGE_INDEX:  # the JSON omits message indexes
             yield KINDS[Op(opcode)], plain(record, content)
 
 
 def plain(record: dict[str, Any], content: bytes) -> dict[str, Any]:
-    """Return a record as the JSON writes one: numbers as texts, bytes as lists of them."""
+    """Return a record as the JSON writes it: numbers as strings, bytes as lists of strings."""
 
     def value(name: str, item: Any) -> Any:
         if name in SPANS:
@@ -52,11 +52,11 @@ def plain(record: dict[str, Any], content: bytes) -> dict[str, Any]:
 
     fields = {name: value(name, item) for name, item in record.items()}
     if "media_type" in fields:
-        fields.pop("crc", None)  # of an attachment: the JSON leaves it out
+        fields.pop("crc", None)  # the JSON omits the CRC of attachments
     return fields
 
 
-def test_every_record_of_every_file() -> None:
+def test_parser_reads_every_conformance_record() -> None:
     assert len(FILES) == 416
     kinds = set[str]()
     for file in FILES:
@@ -66,7 +66,7 @@ def test_every_record_of_every_file() -> None:
     assert kinds == set(KINDS.values()) - {"Chunk", "MessageIndex"}
 
 
-def test_what_the_reader_makes_of_them() -> None:
+def test_reader_yields_conformance_contents() -> None:
     for file in FILES:
         records = expected(file)
         storage = McapFile(file)

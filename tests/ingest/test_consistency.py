@@ -1,4 +1,4 @@
-"""Recordings whose signals contradict each other: what is found, repaired, or kept and said."""
+"""Recordings whose signals contradict each other: findings are repaired, or kept and reported."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,12 +38,12 @@ Topics = dict[str, TopicColumns]
 
 
 def motion(time_s: Any) -> tuple[Any, Any]:
-    """Speed and yaw rate of a robot that winds through a hall, in m/s and rad/s."""
+    """Return speed in m/s and yaw rate in rad/s of a robot that winds through a hall."""
     return 0.35 + 0.2 * np.sin(time_s), 0.7 * np.sin(0.6 * time_s) + 0.1
 
 
 def poses(time_s: Any) -> tuple[Any, Any, Any]:
-    """Where that robot is: x, y and yaw."""
+    """Return x, y and yaw of that robot."""
     fine = np.arange(0, DURATION_S + 1, 0.001)
     speed, rate = motion(fine)
     yaw = np.cumsum(rate) * 0.001
@@ -52,7 +52,7 @@ def poses(time_s: Any) -> tuple[Any, Any, Any]:
 
 
 def winding() -> Topics:
-    """Return what it records, all clocks right."""
+    """Return the topics of that drive, with correct clocks."""
     fast, tenth = np.arange(0, DURATION_S, 0.05), np.arange(0, DURATION_S, 0.1)
     (speed, rate), (requested, turned) = motion(fast), motion(tenth)
     x, y, yaw = poses(fast)
@@ -73,64 +73,69 @@ def _ranges(count: int) -> dict[str, Any]:
 
 
 def shifted(topics: Topics, name: str, seconds: float) -> Topics:
-    """Return the same, with the stamps of a topic ahead by so much."""
-    one = topics[name]
-    stamp = np.asarray(one.fields["header.stamp"]) + round(seconds * NS)
-    return {**topics, name: replace(one, fields={**one.fields, "header.stamp": stamp})}
+    """Return the topics with the stamps of one topic shifted ahead."""
+    columns_ = topics[name]
+    stamp = np.asarray(columns_.fields["header.stamp"]) + round(seconds * NS)
+    return {**topics, name: replace(columns_, fields={**columns_.fields, "header.stamp": stamp})}
 
 
 def scaled(topics: Topics, name: str, factor: float, *paths: str) -> Topics:
-    """Return the same, with fields of a topic multiplied."""
-    one = topics[name]
-    fields = {path: np.asarray(one.fields[path]) * factor for path in paths}
-    return {**topics, name: replace(one, fields={**one.fields, **fields})}
+    """Return the topics with fields of one topic multiplied."""
+    columns_ = topics[name]
+    fields = {path: np.asarray(columns_.fields[path]) * factor for path in paths}
+    return {**topics, name: replace(columns_, fields={**columns_.fields, **fields})}
 
 
 def two_publishers(topics: Topics) -> Topics:
-    """Return the same, with every third message of the odometry from another frame."""
-    one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
-    fields = dict(one.fields)
+    """Return the topics with every third odometry message displaced, as from another publisher."""
+    columns_, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    fields = dict(columns_.fields)
     for axis, moved in (("x", 7.0), ("y", 2.0)):
         path = f"pose.pose.position.{axis}"
         fields[path] = np.asarray(fields[path]) + 0.1 * moved * third
-    return {**topics, "/odom": replace(one, fields=fields)}
+    return {**topics, "/odom": replace(columns_, fields=fields)}
 
 
 def two_frames(topics: Topics) -> Topics:
-    """Return the same drive with every third odometry message in another publisher's frame."""
-    one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    """Return the topics with every third odometry message in another frame."""
+    columns_, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
     frames = np.where(third, "map", "odom").astype(object)
-    return {**topics, "/odom": replace(one, fields={**one.fields, "header.frame_id": frames})}
+    return {
+        **topics,
+        "/odom": replace(columns_, fields={**columns_.fields, "header.frame_id": frames}),
+    }
 
 
 def wrapped(topics: Topics) -> Topics:
-    """Return the same with three turns of 125 rad/s: a heading differentiated across its wrap."""
-    one = topics["/odom"]
-    rate = np.asarray(one.fields[RATE]).copy()
+    """Return the topics with three yaw rates of 125 rad/s, from differences across the wrap."""
+    columns_ = topics["/odom"]
+    rate = np.asarray(columns_.fields[RATE]).copy()
     rate[[100, 301, 500]] -= 2 * np.pi / 0.05
-    return {**topics, "/odom": replace(one, fields={**one.fields, RATE: rate})}
+    return {**topics, "/odom": replace(columns_, fields={**columns_.fields, RATE: rate})}
 
 
 def slipping(topics: Topics) -> Topics:
-    """Return the same, with wheels that turn twice as fast for a third of the time."""
-    one = topics["/odom"]
-    time_s = (np.asarray(one.fields["header.stamp"]) - START_NS) / NS
+    """Return the topics with wheels that turn twice as fast for a third of the time."""
+    columns_ = topics["/odom"]
+    time_s = (np.asarray(columns_.fields["header.stamp"]) - START_NS) / NS
     factor = np.where(time_s % 15 < 5, 2.0, 1.0)
     path = "twist.twist.linear.x"
     return {
         **topics,
-        "/odom": replace(one, fields={**one.fields, path: np.asarray(one.fields[path]) * factor}),
+        "/odom": replace(
+            columns_, fields={**columns_.fields, path: np.asarray(columns_.fields[path]) * factor}
+        ),
     }
 
 
-def written(topics: Topics, folder: Path) -> Path:
+def write_typed(topics: Topics, folder: Path) -> Path:
     return write_topics({name: (TYPES[name], one) for name, one in topics.items()}, folder)
 
 
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
     """Return the profile of the clean drive."""
-    bag = written(winding(), tmp_path_factory.mktemp("clean") / "bag")
+    bag = write_typed(winding(), tmp_path_factory.mktemp("clean") / "bag")
     with open_recording(bag) as recording:
         return parse_profile(
             propose_profile(recording, "r", Given(hindsight_goals=True)).toml, where="t"
@@ -145,20 +150,20 @@ def found_in(topics: Topics, profile: Profile) -> tuple[list[Finding], Any]:
 
 
 @pytest.mark.parametrize("change", [lambda topics: topics, slipping], ids=["clean", "slip"])
-def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, change):
+def test_clean_and_slipping_drives_have_no_findings(profile, change):
     assert found_in(change(winding()), profile)[0] == []
 
 
 @pytest.mark.parametrize(
     ("topic", "ahead_s"), [("/cmd_vel", 0.4), ("/cmd_vel", -0.7), ("/scan", 0.8)]
 )
-def test_a_topic_of_another_clock_counts_from_its_reception(profile, topic, ahead_s):
+def test_topic_with_offset_clock_is_repaired(profile, topic, ahead_s):
     topics = shifted(winding(), topic, ahead_s)
     found, steps = found_in(topics, profile)
     ((kind, name, repaired),) = [(one.kind, one.topic, one.repaired) for one in found]
     assert (kind, name, repaired) == ("clock", topic, True)
     assert f"{abs(ahead_s):.2f} s {'ahead of' if ahead_s > 0 else 'behind'}" in str(found[0])
-    # The command of each step is the one in force where its pose was measured.
+    # The command of each step is the one in force when its pose was measured.
     time_s = _times(steps)
     requested, turned = motion(np.floor(time_s / 0.1 + 1e-3) * 0.1)
     known = np.abs(steps["command_speed_mps"]) > 0
@@ -166,11 +171,11 @@ def test_a_topic_of_another_clock_counts_from_its_reception(profile, topic, ahea
     off = np.abs(steps["command_speed_mps"] - requested) + np.abs(
         steps["command_yaw_rate_radps"] - turned
     )
-    assert np.percentile(off[known], 95) < 0.08  # a step of .1 s changes them by less
+    assert np.percentile(off[known], 95) < 0.08  # a step of 0.1 s changes them by less
 
 
 def _times(steps: Any) -> Any:
-    """When the robot was at the pose of each step."""
+    """Return the time at which the robot was at each step's pose."""
     fine = np.arange(0, DURATION_S, 0.01)
     x, y, _ = poses(fine)
     away = np.hypot(
@@ -179,13 +184,13 @@ def _times(steps: Any) -> Any:
     return fine[np.argmin(away, axis=1)]
 
 
-def test_a_clock_of_the_recorder_alone_is_no_contradiction(profile):
+def test_offset_of_recorder_clock_is_no_finding(profile):
     assert found_in(shifted_all(winding(), 3.0), profile)[0] == []
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("back_s", [0.6, 10.0])
-def test_a_recorders_clock_that_is_set_back_begins_a_segment(profile, tmp_path, back_s, storage):
+def test_recorder_clock_set_back_starts_segment(profile, tmp_path, back_s, storage):
     topics, middle = winding(), START_NS + 20 * NS
     before = {n: without(one, one.log_time_ns < middle) for n, one in topics.items()}
     after = {
@@ -205,12 +210,12 @@ def test_a_recorders_clock_that_is_set_back_begins_a_segment(profile, tmp_path, 
     assert parse_profile(proposed.toml, where="t").task.control_period_s == 0.1
     (found,) = steps.findings
     assert (found.kind, found.topic, found.repaired) == ("clock", "all topics", True)
-    assert len(steps) == len(topics["/cmd_vel"])  # no driving is lost
+    assert len(steps) == len(topics["/cmd_vel"])  # all steps are kept
     assert steps.segment.max() == 1
     assert np.abs(steps.signals["localised_speed_mps"]).max() < 0.7
 
 
-def test_a_topic_that_alone_lies_out_of_order_is_no_set_back(profile, tmp_path):
+def test_single_topic_out_of_order_is_no_clock_set_back(profile, tmp_path):
     topics, middle = winding(), START_NS + 20 * NS
     late = without(topics["/imu"], topics["/imu"].log_time_ns < middle)
     rest = without(topics["/imu"], topics["/imu"].log_time_ns >= middle)
@@ -221,7 +226,7 @@ def test_a_topic_that_alone_lies_out_of_order_is_no_set_back(profile, tmp_path):
 
 
 def shifted_all(topics: Topics, seconds: float) -> Topics:
-    """Return the same, with all stamps ahead by so much."""
+    """Return the topics with all stamps shifted ahead."""
     for name in topics:
         topics = shifted(topics, name, seconds)
     return topics
@@ -229,7 +234,7 @@ def shifted_all(topics: Topics, seconds: float) -> Topics:
 
 SPEED, RATE = "twist.twist.linear.x", "twist.twist.angular.z"
 GYRO = "angular_velocity.z"
-WRONG = {
+CONTRADICTIONS = {
     "two publishers": (two_publishers, "sources", "/odom", "two publishers"),
     "two frames": (two_frames, "sources", "/odom", "in several frames: odom ("),
     "no speed": (lambda t: scaled(t, "/odom", 0, SPEED, RATE), "wheels", "/odom", "stays at 0"),
@@ -243,20 +248,20 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_contradicts_itself_is_kept_and_said(profile, case):
-    change, kind, topic, words = WRONG[case]
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_contradiction_is_reported_and_kept(profile, case):
+    change, kind, topic, message = CONTRADICTIONS[case]
     found, steps = found_in(change(winding()), profile)
-    assert kind in {one.kind for one in found}, found
-    one = next(one for one in found if one.kind == kind)
-    assert (one.topic, one.repaired) == (topic, False)
-    assert words in str(one)
-    assert 0 < one.steps <= len(steps["stamp_ns"])
+    assert kind in {finding.kind for finding in found}, found
+    finding = next(finding for finding in found if finding.kind == kind)
+    assert (finding.topic, finding.repaired) == (topic, False)
+    assert message in str(finding)
+    assert 0 < finding.steps <= len(steps["stamp_ns"])
 
 
-def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, shell):
+def test_contradiction_is_printed_stored_and_exits_with_3(tmp_path, shell):
     clean, wrong = (
-        written(one, tmp_path / name)
+        write_typed(one, tmp_path / name)
         for name, one in (("clean", winding()), ("wrong", two_publishers(winding())))
     )
     file, store = tmp_path / "p.toml", tmp_path / "store"
@@ -269,13 +274,13 @@ def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, shell):
     query = "SELECT kind, topic, repaired FROM (SELECT unnest(findings, recursive := true)"
     (row,) = shell.json("sql", store, f"{query} FROM recordings)")
     assert row == {"kind": "sources", "topic": "/odom", "repaired": False}
-    said = shell.json("audit", store, code={0, 1, 3})["audits"]
-    (audit,) = [each for each in said if each["audit"] == "contradictions"]
+    audits = shell.json("audit", store, code={0, 1, 3})["audits"]
+    (audit,) = [each for each in audits if each["audit"] == "contradictions"]
     assert (audit["status"], audit["rows"]) == ("warn", 1)
 
 
-def test_profile_new_does_not_use_wheels_that_are_none(tmp_path):
-    bag = written(scaled(winding(), "/odom", 0, SPEED, RATE), tmp_path / "bag")
+def test_profile_new_ignores_odometry_without_speed(tmp_path):
+    bag = write_typed(scaled(winding(), "/odom", 0, SPEED, RATE), tmp_path / "bag")
     made = proposed(bag, file := tmp_path / "p.toml", "--hindsight-goals")
     assert (made.inputs.wheels, made.motion is None) == (None, False)
     with ingested(bag, file, tmp_path / "store") as opened:
@@ -283,8 +288,8 @@ def test_profile_new_does_not_use_wheels_that_are_none(tmp_path):
     assert mean == pytest.approx(motion(np.arange(0, DURATION_S, 0.1))[0].mean(), abs=0.02)
 
 
-def test_profile_new_names_two_publishers(tmp_path):
-    wrong, file = written(two_publishers(winding()), tmp_path / "wrong"), tmp_path / "p.toml"
+def test_profile_new_reports_two_publishers(tmp_path):
+    wrong, file = write_typed(two_publishers(winding()), tmp_path / "wrong"), tmp_path / "p.toml"
     proposed(wrong, file, "--hindsight-goals", codes=(3,))
     assert "localiser_m" not in file.read_text()
     assert "# CONTRADICTS ITSELF: /odom: its poses step" in file.read_text()

@@ -1,4 +1,4 @@
-"""What messages say in place of a value that was not measured is no value: null, and counted."""
+"""Values that messages mark as not measured become null and are counted."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ Topics = dict[str, tuple[str, TopicColumns]]
 
 
 def covariance(count: int, unknown: Any) -> np.ndarray:
-    """Of each message (N, 9), with -1 as its first element where it is unknown."""
+    """Return the covariances (N, 9) of messages, with -1 first if unknown."""
     rows = np.zeros((count, 9))
     rows[unknown, 0] = -1
     return rows
@@ -32,7 +32,9 @@ def drive(**unknown: Any) -> Topics:
     """Return a drive whose wheels turn, and whose IMU sometimes reports no measurement."""
     topics = typed_topics(Drive(SECONDS))
     fast = np.arange(0, SECONDS, 0.02)
-    said = {f"{key}_covariance": covariance(len(fast), rows) for key, rows in unknown.items()}
+    covariances = {
+        f"{key}_covariance": covariance(len(fast), rows) for key, rows in unknown.items()
+    }
     topics["/imu"] = (
         "sensor_msgs/msg/Imu",
         columns(
@@ -40,7 +42,7 @@ def drive(**unknown: Any) -> Topics:
             {
                 "angular_velocity.z": np.full(len(fast), 0.1),
                 "linear_acceleration.x": np.full(len(fast), 0.3),
-                **said,
+                **covariances,
             },
         ),
     )
@@ -53,7 +55,7 @@ def found_in(topics: Topics) -> Steps:
     return steps_of(load_profile("warehouse_amr"), {name: one for name, (_, one) in topics.items()})
 
 
-def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
+def test_imu_without_gyro_falls_back_to_wheels(tmp_path: Path) -> None:
     topics = drive(angular_velocity=slice(None))
     steps = found_in(topics)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
@@ -70,8 +72,8 @@ def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
     assert stand_ins["imu"] == "gyro yaw rate taken from the wheels"
 
 
-def test_only_what_is_unknown_is_left_out() -> None:
-    """The gyroscope fails half way; there is no accelerometer."""
+def test_partly_unknown_gyro_falls_back_to_wheels() -> None:
+    """The gyroscope fails half way, and there is no accelerometer."""
     half = slice(150, None)
     steps = found_in(drive(angular_velocity=half, linear_acceleration=slice(None)))
     gyro = steps.signals["gyro_yaw_rate_radps"]
@@ -82,13 +84,13 @@ def test_only_what_is_unknown_is_left_out() -> None:
     assert any("150 of 300 messages of /imu have no estimate of angular" in n for n in steps.notes)
 
 
-def test_a_known_covariance_changes_nothing() -> None:
+def test_known_covariance_keeps_gyro() -> None:
     steps = found_in(drive(angular_velocity=slice(0)))
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(0.1)
     assert not [note for note in steps.notes if "estimate" in note]
 
 
-def test_odometry_without_speeds_makes_no_rows() -> None:
+def test_odometry_without_speeds_gives_no_rows() -> None:
     topics = drive()
     fields = topics["/odom"][1].fields
     unknown = np.zeros((len(topics["/odom"][1]), 36))
@@ -98,7 +100,7 @@ def test_odometry_without_speeds_makes_no_rows() -> None:
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
-def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
+def test_unmeasured_signals_are_null(tmp_path: Path) -> None:
     topics = drive(angular_velocity=slice(None))
     ticks = np.arange(0, SECONDS, 0.1)
     share = np.where(ticks < 3, 0.8, np.nan)
@@ -114,7 +116,7 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
         "sensor_msgs/msg/LaserScan",
         columns(ticks, scan | {"ranges": ragged(list(beams.T))}),
     )
-    wanted = {
+    signals = {
         "gyro": ("/imu", "Imu", "angular_velocity.z", ""),
         "share": ("/battery", "BatteryState", "percentage", ""),
         "voltage": ("/battery", "BatteryState", "voltage", ""),
@@ -124,15 +126,15 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     text = WAREHOUSE + "".join(
         f'\n[signals.{name}]\ntopic = "{topic}"\ntype = "sensor_msgs/msg/{kind}"\n'
         f'path = "{path}"\nunit = "1"\nmax_age_s = 0.5\n{more}\n'
-        for name, (topic, kind, path, more) in wanted.items()
+        for name, (topic, kind, path, more) in signals.items()
     )
     steps = steps_in(write_topics(topics, tmp_path / "bag", storage="mcap"), text)
-    found = {name: steps.custom.table[name].to_pylist() for name in wanted}
+    found = {name: steps.custom.table[name].to_pylist() for name in signals}
     assert set(found["gyro"]) == {None}
     assert found["share"][:15] == pytest.approx([0.8] * 15, abs=1e-6)
     assert set(found["share"][16:]) == {None}
     assert set(found["voltage"]) == {24.0}
-    assert found["sonar"][0] == pytest.approx(0.2)  # nearer than it can measure
+    assert found["sonar"][0] == pytest.approx(0.2)  # nearer than the sensor can measure
     assert found["sonar"][12] == 1.5
     assert found["sonar"][-1] is None
     assert {round(beam, 3) for beam in found["beam"]} <= {0.1, 2.0}
@@ -142,14 +144,14 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     assert "signals.voltage" not in notes
 
 
-def test_a_scan_of_a_wall_that_is_too_close_is_near() -> None:
-    """The same drive with what is nearer than .3 m measured, and as -inf."""
+def test_minus_infinity_beams_are_near_obstacles() -> None:
+    """Compare ranges below 0.3 m as measured with the same ranges as -inf."""
     tenth = np.arange(0, SECONDS, 0.1)
     found = []
     for name, too_close in (("measured", 0.25), ("reported", -np.inf)):
         ranges = np.full((len(tenth), BEAMS), 3.0, np.float32)
         ranges[20:40, BEAMS // 2 - 3 : BEAMS // 2 + 3] = too_close  # ahead, within the outline
-        ranges[50] = -np.inf if name == "reported" else 0.0  # covered: it knows of nothing
+        ranges[50] = -np.inf if name == "reported" else 0.0  # covered: no beam has a range
         topics = drive()
         topics["/scan"] = ("sensor_msgs/msg/LaserScan", columns(tenth, scans(ranges)))
         found.append(found_in(topics))
@@ -165,8 +167,8 @@ def test_a_scan_of_a_wall_that_is_too_close_is_near() -> None:
     assert not any("-inf" in note for note in measured.notes)
 
 
-def test_a_robot_sees_what_its_recordings_say() -> None:
-    """The observer on a robot takes the wheels' yaw rate, too."""
+def test_live_observer_flags_unknown_gyro() -> None:
+    """The observer on a robot uses the wheels' yaw rate instead, too."""
     observer = LiveObserver(load_profile("warehouse_amr"))
     point = SimpleNamespace(x=0.0, y=0.0, z=0.1)
     unknown = [-1.0] + [0.0] * 8

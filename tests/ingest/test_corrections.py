@@ -1,4 +1,4 @@
-"""Corrections of labels: laid over the rules' labels, kept through relabelling and re-ingest."""
+"""Label corrections: they override rule labels and survive relabelling and re-ingest."""
 
 import datetime as dt
 import shutil
@@ -29,22 +29,22 @@ from restock.replay.store.store import Store
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}"\n'
-HALF_WAY, FURTHER = "lead(pose_x_m) OVER episode > 2.55", "pose_x_m > 2.8"
+BEYOND_2_55_M_NEXT, BEYOND_2_8_M = "lead(pose_x_m) OVER episode > 2.55", "pose_x_m > 2.8"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of one episode in a store, with a condition of its own, `soon`."""
+def ingested_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a store of one recording and a profile with the condition `soon`."""
     folder = tmp_path_factory.mktemp("corrections")
-    profile(folder, HALF_WAY)
+    profile(folder, BEYOND_2_55_M_NEXT)
     write_bag(Drive(goals=[(0.0, 11.0, 1.0)]), folder / "a")
     assert ingest(folder) == 0
     return folder
 
 
 @pytest.fixture
-def store(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+def store(ingested_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(ingested_folder, tmp_path, dirs_exist_ok=True)
     return tmp_path / "store"
 
 
@@ -63,8 +63,8 @@ def labels(store: Path, columns: str = "conditions") -> list[tuple]:
         return opened.sql(query).fetchall()
 
 
-def said(store: Path, first: int, last: int, value: bool, condition: str = "soon") -> None:
-    """Correct these steps of the only episode."""
+def correct(store: Path, first: int, last: int, value: bool, condition: str = "soon") -> None:
+    """Correct the label of these steps of the only episode."""
     with Store(store) as opened:
         recording, ingest_id, first_ns, last_ns = opened.sql(
             "SELECT any_value(recording_id), any_value(ingest_id), min(logged_ns), max(logged_ns)"
@@ -76,47 +76,48 @@ def said(store: Path, first: int, last: int, value: bool, condition: str = "soon
     correct_store(StoreWriter(store), {recording: given})
 
 
-def soon(store: Path) -> list[int]:
-    """Return the steps that have the label."""
+def soon_steps(store: Path) -> list[int]:
+    """Return the steps labelled `soon`."""
     found = labels(store, "step_index, list_contains(conditions, 'soon')")
     return [step for step, holds in found if holds]
 
 
 def test_corrections_survive_relabelling_and_ingest(store, tmp_path, capsys):
-    before = soon(store)
-    said(store, 2, 4, True)
-    said(store, before[0], before[1], False)
+    before = soon_steps(store)
+    correct(store, 2, 4, True)
+    correct(store, before[0], before[1], False)
     wanted = [2, 3, 4, *before[2:]]
-    assert soon(store) == wanted
+    assert soon_steps(store) == wanted
     (version,) = {version for (version,) in labels(store, "labels_version")}
     rules = load_profile(tmp_path / "amr.toml").labels_version
     assert version.startswith(f"{rules}+")
 
     capsys.readouterr()
-    assert ingest(tmp_path) == 0  # its definitions are what they were
+    assert ingest(tmp_path) == 0  # its definitions are the same
     assert "unchanged" in capsys.readouterr().out
 
-    profile(tmp_path, FURTHER)  # other rules
+    profile(tmp_path, BEYOND_2_8_M)  # other rules
     conditions = load_profile(tmp_path / "amr.toml").conditions
     relabel_store(StoreWriter(store), lambda name: conditions)
-    assert soon(store)[:3] == [2, 3, 4]
-    assert not set(soon(store)) & set(before[:2])
-    assert len(soon(store)) > 3
+    assert soon_steps(store)[:3] == [2, 3, 4]
+    assert not set(soon_steps(store)) & set(before[:2])
+    assert len(soon_steps(store)) > 3
 
-    (tmp_path / "amr.toml").write_text(WAREHOUSE)  # no such condition: kept, and said
+    # without the condition: corrections are kept and reported
+    (tmp_path / "amr.toml").write_text(WAREHOUSE)
     assert ingest(tmp_path) == 0
     assert "2 of them are about conditions or steps that no longer exist" in capsys.readouterr().out
-    profile(tmp_path, HALF_WAY)
+    profile(tmp_path, BEYOND_2_55_M_NEXT)
     assert ingest(tmp_path) == 0
     assert "2 corrections of its labels are kept" in capsys.readouterr().out
-    assert soon(store) == wanted
+    assert soon_steps(store) == wanted
 
 
-def test_taken_out_the_labels_of_the_rules_are_there_again(store: Path) -> None:
+def test_removing_corrections_restores_rule_labels(store: Path) -> None:
     columns = "* EXCLUDE (ingest_id)"
     before = labels(store, columns)
-    said(store, 2, 4, True)
-    said(store, 3, 3, False)
+    correct(store, 2, 4, True)
+    correct(store, 3, 3, False)
     assert labels(store, columns) != before
     (outcome,), _ = remove_corrections(StoreWriter(store))
     assert "+" not in outcome.after
@@ -127,7 +128,7 @@ def test_taken_out_the_labels_of_the_rules_are_there_again(store: Path) -> None:
 def test_views_and_panels_show_corrections(store: Path, tmp_path: Path) -> None:
     mixture = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     plain = panel_of(store, mixture, tmp_path / "plain").header.labels_version
-    said(store, 2, 4, True)
+    correct(store, 2, 4, True)
     with Store(store) as opened:
         query = "SELECT condition, value, rows, last_ns > first_ns, given_at FROM corrections"
         assert opened.sql(query).fetchall() == [("soon", True, 3, True, NOW)]
@@ -137,7 +138,7 @@ def test_views_and_panels_show_corrections(store: Path, tmp_path: Path) -> None:
     assert corrected.startswith(f"{plain}+")
 
 
-def test_condition_conditions_probabilities_and_uncertain_follow(tmp_path: Path) -> None:
+def test_correction_updates_all_label_columns(tmp_path: Path) -> None:
     writer = StoreWriter(tmp_path / "store")
     writer.write(*one(1))
     before = writer.rows(*writer_key(writer))
@@ -152,7 +153,7 @@ def test_condition_conditions_probabilities_and_uncertain_follow(tmp_path: Path)
         after = writer.rows(*writer_key(writer))
         held = after["conditions"][row].as_py()
         assert ("recovery" in held) == value
-        if value:  # of the lowest priority number
+        if value:  # the lowest priority number
             assert after["condition"][row].as_py() == "recovery"
         assert dict(after["probabilities"][row].as_py())["recovery"] == float(value)
         assert after["uncertain"][row].as_py() == []
@@ -168,46 +169,46 @@ def writer_key(writer: StoreWriter) -> tuple[str, str]:
     return row["recording_id"], row["ingest_id"]
 
 
-STRETCHES = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.booleans()), max_size=5)
+INTERVALS = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.booleans()), max_size=5)
 
 
 @settings(max_examples=80)
-@given(STRETCHES, STRETCHES)
-def test_what_is_said_last_counts_and_nothing_is_said_twice(first, second):
+@given(INTERVALS, INTERVALS)
+def test_merged_corrections_do_not_overlap_and_last_wins(first, second):
     moments = Moments(np.zeros(20, np.int64), np.arange(20) * 100)
     painted = np.full(20, -1)
 
-    def corrections(stretches: list[tuple[int, int, bool]]) -> list[Correction]:
-        made: list[Correction] = []
-        for begin, more, value in stretches:  # of one file, no two contradict each other
+    def corrections(intervals: list[tuple[int, int, bool]]) -> list[Correction]:
+        accepted: list[Correction] = []
+        for begin, more, value in intervals:  # corrections of one file do not contradict each other
             taken = np.zeros(20, bool)
-            for other in made:
+            for other in accepted:
                 taken |= moments.covered(other)
             end = min(begin + more, 19)
             if not taken[begin : end + 1].any():
-                made.append(Correction("x", value, 0, begin * 100, end * 100, NOW))
-        return made
+                accepted.append(Correction("x", value, 0, begin * 100, end * 100, NOW))
+        return accepted
 
-    before, given = corrections(first), corrections(second)
-    for said in (*before, *given):
-        painted[moments.covered(said)] = said.value
-    every = merged(before, given, moments)
+    before, later = corrections(first), corrections(second)
+    for correction in (*before, *later):
+        painted[moments.covered(correction)] = correction.value
+    every = merged(before, later, moments)
     covered = np.zeros(20, np.int64)
     result = np.full(20, -1)
-    for said in every:
-        covered += moments.covered(said)
-        result[moments.covered(said)] = said.value
+    for correction in every:
+        covered += moments.covered(correction)
+        result[moments.covered(correction)] = correction.value
     assert covered.max() <= 1
     np.testing.assert_array_equal(result, painted)
-    again = merged(every, given, moments)
+    again = merged(every, later, moments)
     assert corrected_version("r", again) == corrected_version("r", every)
 
 
-def test_episodes_tell_repeated_times_apart() -> None:
+def test_correction_applies_to_its_episode_only() -> None:
     moments = Moments(np.array([0, 0, 1, 1]), np.array([10, 20, 10, 20]))
     correction = Correction("x", True, 1, 10, 20, NOW)
     assert moments.covered(correction).tolist() == [False, False, True, True]
-    # Split otherwise since, by another profile: the time says which rows.
+    # Another profile has split the episodes differently since, so the time alone selects the rows.
     moved = Correction("x", True, 7, 10, 10, NOW)
     assert moments.covered(moved).tolist() == [True, False, True, False]
 
