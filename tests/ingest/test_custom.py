@@ -1,4 +1,4 @@
-"""Custom signals: from any field to a column of the table, and into conditions and queries."""
+"""Custom signals: from any message field to table columns, conditions and queries."""
 
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def with_signals(*tables: str) -> str:
 def steps_with(
     table: str, fields: dict[str, FieldColumn], times: list[float] | None = None
 ) -> Steps:
-    """Return a drive of six seconds with messages of /x at these times (default: each second)."""
+    """Return a 6 s drive with messages of /x at these times (default: every second)."""
     at = np.arange(0.0, 6.0) if times is None else np.array(times)
     topics = Drive().topics() | {"/x": columns(at, fields)}
     return steps_of(parse_profile(with_signals(table), where="p"), topics)
@@ -46,10 +46,10 @@ def column(table: str, fields: dict[str, FieldColumn], times: list[float] | None
     return steps_with(table, fields, times).custom.table["s"].to_pylist()
 
 
-def test_a_value_is_held_from_its_measurement_to_its_age():
+def test_value_is_held_until_its_maximum_age():
     fields = {"v": np.array([10.0, 20.0])}
     held = column(signal("s", "v", "max_age_s = 1.0"), fields, [0.5, 3.0])
-    # Ticks are every .2 s from .005 s on.
+    # Ticks are every 0.2 s, starting at 0.005 s.
     assert held[:3] == [None] * 3
     assert held[3:8] == [10.0] * 5
     assert held[8:15] == [None] * 7
@@ -57,7 +57,7 @@ def test_a_value_is_held_from_its_measurement_to_its_age():
     assert held[20:] == [None] * 10
 
 
-def test_messages_that_lack_the_element_are_no_samples():
+def test_messages_without_element_are_skipped():
     """Diagnostics come from many nodes: each message holds the statuses of one."""
     fields = {
         "status[].name": ragged([["battery"], ["lidar"], ["battery", "lidar"], [], [], []]),
@@ -66,11 +66,11 @@ def test_messages_that_lack_the_element_are_no_samples():
     }
     path = "status[name=battery].values[key=v].value"
     held = column(signal("s", path), fields)
-    assert held[1:10] == [24.0] * 9  # through the lidar's message
+    assert held[1:10] == [24.0] * 9  # held over the message about the lidar
     assert held[11:] == [23.5] * 19
 
 
-def test_an_empty_list_is_a_value_and_nan_is_null():
+def test_empty_list_is_a_value_and_nan_is_null():
     ranges = ragged([[1.0, np.inf, 3.0, 4.0], [], [np.nan] * 3, [2.0], [2.0], [2.0]])
     lists = column(signal("s", "ranges[::2]"), {"ranges": ranges})
     assert [lists[i] for i in (1, 6, 11, 16)] == [[1.0, 3.0], [], [None, None], [2.0]]
@@ -78,13 +78,19 @@ def test_an_empty_list_is_a_value_and_nan_is_null():
     assert [nearest[i] for i in (1, 6, 11, 16)] == [1.0, None, None, 2.0]
 
 
-HALF = 0.3 / 2  # of a turn
+HALF = 0.3 / 2  # half of the turn
 TURN = {"x": 0.0, "y": 0.0, "z": np.sin(HALF), "w": np.cos(HALF)}
 NUMBERS = [
-    # Reductions are of the finite elements.
+    # Reductions use finite elements only.
     *(
-        (signal("s", "r[]", f'reduce = "{how}"'), {"r": ragged([[4.0, np.inf, 1.0]])}, want)
-        for how, want in (("min", 1.0), ("max", 4.0), ("mean", 2.5), ("sum", 5.0), ("count", 3.0))
+        (signal("s", "r[]", f'reduce = "{how}"'), {"r": ragged([[4.0, np.inf, 1.0]])}, expected)
+        for how, expected in (
+            ("min", 1.0),
+            ("max", 4.0),
+            ("mean", 2.5),
+            ("sum", 5.0),
+            ("count", 3.0),
+        )
     ),
     (signal("s", "v", "scale = 1.8", "offset = 32", 'unit = "°F"'), {"v": np.array([100.0])}, 212),
     (signal("s", "b"), {"b": np.array([True])}, 1.0),
@@ -103,16 +109,16 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("table", "fields", "want"), NUMBERS)
-def test_a_value_becomes_a_number(table, fields, want):
+@pytest.mark.parametrize(("table", "fields", "expected"), NUMBERS)
+def test_value_is_converted_to_number(table, fields, expected):
     held = column(table, fields, [0.5])
     assert held[:3] == [None] * 3
-    assert held[3:] == [want] * 27  # without an age it is latched
+    assert held[3:] == [expected] * 27  # latched, as it has no maximum age
 
 
-def test_texts_that_are_no_number_are_counted_and_shown():
-    said = np.array(["24.5", "n/a", "n/a"], object)
-    steps = steps_with(signal("s", "t"), {"t": said}, [0.0, 1.0, 2.0])
+def test_non_numeric_text_is_counted_and_shown():
+    texts = np.array(["24.5", "n/a", "n/a"], object)
+    steps = steps_with(signal("s", "t"), {"t": texts}, [0.0, 1.0, 2.0])
     assert steps.custom.table["s"].to_pylist()[:12] == [24.5] * 5 + [None] * 7
     assert steps.notes == [
         "signals.s: 2 of 3 messages have a value that is not a number, such as 'n/a'"
@@ -121,7 +127,7 @@ def test_texts_that_are_no_number_are_counted_and_shown():
     assert (row["messages"], row["found"], row["unread"], row["steps"]) == (3, 1, 2, 5)
 
 
-def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
+def test_missing_topic_gives_nulls_and_is_reported():
     from restock.ingest.steps.aligned_inputs import fallbacks_used
 
     profile = parse_profile(with_signals(signal("s", "v"), signal("l", "v[]")), where="p")
@@ -132,7 +138,7 @@ def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         (signal("clearance_m", "v"), "`signals.clearance_m`: Restock has a column of this name"),
         (signal("select", "v"), "`signals.select`: this name is a keyword of SQL"),
@@ -146,19 +152,19 @@ def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
         ('[signals.s]\ntopic = "/x"\n', "missing key `signals.s."),
     ],
 )
-def test_what_a_signal_may_not_say(table, said):
+def test_invalid_signal_is_rejected(table, message):
     with pytest.raises(ConfigError) as error:
         parse_profile(with_signals(table), where="mine.toml")
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert str(error.value).startswith("mine.toml: ")
 
 
-def test_a_value_that_is_no_number_names_the_key():
+def test_array_value_is_reported_with_its_key():
     with pytest.raises(RecordingError, match=r"`signals\.s\.path`: 'a' of /x gives an array"):
         steps_with(signal("s", "a"), {"a": np.zeros((1, 3))}, [0.0])
 
 
-def test_check_says_what_the_topic_offers_instead(tmp_path, shell):
+def test_profile_check_suggests_existing_fields(tmp_path, shell):
     profile = tmp_path / "p.toml"
     joints = {"topic": "/joint_states", "kind": "sensor_msgs/msg/JointState"}
     profile.write_text(
@@ -170,14 +176,14 @@ def test_check_says_what_the_topic_offers_instead(tmp_path, shell):
             signal("e", "data", topic="/bumpr", kind="std_msgs/msg/Bool"),
         )
     )
-    said = shell.json("profile", "check", profile, SAMPLE, code=2)
-    assert said["outcome"] is None
-    assert [problem.split(":")[0] for problem in said["problems"]] == [
+    check = shell.json("profile", "check", profile, SAMPLE, code=2)
+    assert check["outcome"] is None
+    assert [problem.split(":")[0] for problem in check["problems"]] == [
         "/bumper holds std_msgs/msg/Bool, not std_msgs/msg/Float64 (signals.d)",
         *("`signals.a.path`", "`signals.b.path`", "`signals.c.path`"),
     ]
-    assert "did you mean 'velocity'?" in said["problems"][1]
-    assert "write velocity[0] for one element" in said["problems"][3]
+    assert "did you mean 'velocity'?" in check["problems"][1]
+    assert "write velocity[0] for one element" in check["problems"][3]
 
 
 OWN = [
@@ -199,14 +205,14 @@ sql = "left_radps > {} AND len(beams_m) = 2 AND battery_v > 20"
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the sample bag with custom signals, and a condition on them."""
+    """Return a store of the sample bag with custom signals and a condition that uses them."""
     folder = tmp_path_factory.mktemp("custom")
     (folder / "p.toml").write_text(with_signals(*OWN, FAST.format(5)))
     ingested(SAMPLE, folder / "p.toml", folder / "store").close()
     return folder / "store"
 
 
-def test_they_are_columns_of_the_table_with_units(store, shell):
+def test_custom_signals_are_columns_with_units(store, shell):
     (row,) = shell.json(
         "sql",
         store,
@@ -215,28 +221,33 @@ def test_they_are_columns_of_the_table_with_units(store, shell):
         " corr(left_radps, wheel_speed_mps) AS follows FROM transitions",
     )
     assert row["rows"] == row["beams"] == ROWS
-    assert 0.8 * ROWS < row["left"] <= ROWS  # every 2 s: unknown at some ticks after a pause
+    # sampled every 2 s: unknown at some ticks after a pause
+    assert 0.8 * ROWS < row["left"] <= ROWS
     assert row["fewest"] == 2
     assert 20 < row["battery"] < 30
     assert row["follows"] > 0.5
     docs = shell.json("sql", store, "FROM columns WHERE view = 'transitions'")
-    said = {doc["column_name"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
-    assert said["left_radps"] == ("DOUBLE", "rad/s", "velocity[left_wheel_joint] of /joint_states")
-    assert said["beams_m"] == ("FLOAT[]", "m", "some beams")
+    described = {doc["column_name"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
+    assert described["left_radps"] == (
+        "DOUBLE",
+        "rad/s",
+        "velocity[left_wheel_joint] of /joint_states",
+    )
+    assert described["beams_m"] == ("FLOAT[]", "m", "some beams")
     (file,) = (store / "transitions").glob("*/*.parquet")
     field = pq.read_schema(file).field("left_radps")
     assert field.metadata[b"unit"] == b"rad/s"
     rows = shell.json("sql", store, "SELECT unnest(signals, recursive := true) FROM recordings")
-    said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
-    assert said == [
+    stored = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
+    assert stored == [
         ("left_radps", "rad/s", "number", 83),
         ("beams_m", "m", "list", 779),
         ("battery_v", "V", "number", 38),
     ]
 
 
-def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, shell):
-    """Stored signals are enough: no recording is read, and the audit names the old labels."""
+def test_relabelling_uses_stored_custom_signals(store, tmp_path, shell):
+    """Relabelling reads no recording, and no row keeps an old labels version."""
     by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
     labelled = "SELECT count(*) AS n FROM transitions WHERE primary_condition = 'fast_wheel'"
     (before,), (five,) = (
@@ -258,29 +269,29 @@ def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, 
     assert shell.json("sql", store, versions) == [{"n": 1}]
 
 
-def test_a_condition_on_an_unstored_signal_needs_an_ingest(store, tmp_path, shell):
+def test_condition_on_unstored_signal_needs_ingest(store, tmp_path, shell):
     more = signal("imu_z", "linear_acceleration.z", topic="/imu", kind="sensor_msgs/msg/Imu")
     own = '[[condition]]\nname = "heavy"\ntiming = "pre"\nsql = "imu_z > 9"\n'
     profile = tmp_path / "p.toml"
     profile.write_text(with_signals(*OWN, more, own))
-    said = shell.err("store", "label", store, "--profile", profile)
-    assert "condition 'heavy'" in said
-    assert "imu_z" in said
-    assert "ingest the recordings again" in said
+    stderr = shell.err("store", "label", store, "--profile", profile)
+    assert "condition 'heavy'" in stderr
+    assert "imu_z" in stderr
+    assert "ingest the recordings again" in stderr
 
 
-def test_another_meaning_of_a_stores_column_is_refused(store, tmp_path, shell):
+def test_signal_with_another_unit_is_rejected(store, tmp_path, shell):
     other = OWN[0].replace('"rad/s"', '"rpm"')
     profile = tmp_path / "p.toml"
     profile.write_text(with_signals(other))
     command = ["ingest", str(SAMPLE), "--store", str(store), "--profile", str(profile)]
-    said = shell.err(*command)
-    assert "its column `left_radps` is a number in rad/s, and `signals.left_radps`" in said
-    assert "rename the signal" in said
+    stderr = shell.err(*command)
+    assert "its column `left_radps` is a number in rad/s, and `signals.left_radps`" in stderr
+    assert "rename the signal" in stderr
     assert shell.json("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": ROWS}]
 
 
-def test_a_vector_has_one_length_and_others_are_null_and_counted():
+def test_vectors_of_wrong_length_are_null_and_counted():
     fields = {"v": ragged([[1, 2], [3, 4, 5], [6, 7], []])}
     table = signal("s", "v[]", "length = 2", "max_age_s = 1.0")
     steps = steps_with(table, fields, [0.0, 1.0, 2.0, 3.0])
@@ -294,15 +305,17 @@ def test_a_vector_has_one_length_and_others_are_null_and_counted():
     assert any("2 of 4 messages do not have the length 2" in note for note in steps.notes)
 
 
-def test_a_vectors_length_is_part_of_what_a_column_means():
+def test_vector_length_must_match_stored_column():
     with pytest.raises(ConfigError, match="the length of a vector needs a list"):
         parse_profile(with_signals(signal("s", "v[0]", "length = 2")), where="p")
     two, three, none = (
         parse_profile(with_signals(signal("s", "v[]", *more)), where="p").signals["s"].field("s")
         for more in (["length = 2"], ["length = 3"], [])
     )
-    have = {"s": Field("s", ArrayType("float", True), metadata={"unit": "1", "length": "2"})}
-    refuse_other_signals(have, pa.schema([two]), "store")
+    stored_fields = {
+        "s": Field("s", ArrayType("float", True), metadata={"unit": "1", "length": "2"})
+    }
+    refuse_other_signals(stored_fields, pa.schema([two]), "store")
     for other in (three, none):
         with pytest.raises(StoreError, match="is a vector of 2 in 1"):
-            refuse_other_signals(have, pa.schema([other]), "store")
+            refuse_other_signals(stored_fields, pa.schema([other]), "store")

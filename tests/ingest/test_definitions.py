@@ -1,4 +1,4 @@
-"""Definitions of messages: as the files of packages have them, by hand, and of steered robots."""
+"""Message definitions: as package files contain them, given by folder, and of steered robots."""
 
 import math
 from pathlib import Path
@@ -45,7 +45,7 @@ module a_msgs {
 """
 IDL = f"{RULE}IDL: a_msgs/msg/Twist\n{TOP}\n{RULE}IDL: a_msgs/msg/Header\n{INNER}"
 GUARDED = "#pragma once\n#ifndef A__TWIST_\n#define A__TWIST_\n" + TOP + "#endif  // A__TWIST_\n"
-# An own Header, of which ROS 1 and ROS 2 mean other messages.
+# Our own Header type, whose name means another message in ROS 1 and in ROS 2.
 MSG = f"uint8 level 1  # of the tank\nHeader header\n# the end\n\n{RULE}MSG: a_msgs/Header\n"
 MSG += "float32 left\nfloat64 right\n"
 
@@ -71,7 +71,7 @@ def recorded(path: Path, form: str, text: str, name: str = "a_msgs/msg/Twist") -
     ],
     ids=["idl", "idl CRLF", "idl blank", "idl guard", "msg", "msg CRLF", "msg blank", "msg BOM"],
 )
-def test_definitions_are_read_as_their_files_are(tmp_path: Path, form: str, text: str) -> None:
+def test_recorded_definitions_are_parsed(tmp_path: Path, form: str, text: str) -> None:
     with open_recording(recorded(tmp_path / "run.mcap", form, text)) as recording:
         assert recording.topics["/twist"].skipped is None
         leaves = ["level", "header.left", "header.right"]
@@ -80,18 +80,18 @@ def test_definitions_are_read_as_their_files_are(tmp_path: Path, form: str, text
         assert [columns.fields[leaf].tolist() for leaf in leaves] == [[7], [0.5], [-2.0]]
 
 
-def test_files_of_a_folder_are_read_alike(tmp_path: Path) -> None:
+def test_definition_files_of_folder_are_parsed(tmp_path: Path) -> None:
     folder = tmp_path / "a_msgs" / "msg"
     folder.mkdir(parents=True)
     (folder / "Twist.idl").write_bytes(TOP.replace("\n", "\r\n").encode())
     assert "a_msgs/msg/Twist" in folder_types(str(tmp_path))
     (folder / "Bad.msg").write_text("float64 x\nfloat64 == 3\n")
     with pytest.raises(RecordingError, match="cannot be parsed at 'float64 == 3'"):
-        folder_types(str(folder))  # another name, as they are read once
+        folder_types(str(folder))  # another path, as folders are cached
 
 
 @pytest.mark.parametrize("name", ["a_msgs/Twist", "a_msgs/msg/Twist"])
-def test_a_type_has_one_name_with_or_without_msg(tmp_path: Path, name: str) -> None:
+def test_type_name_is_the_same_with_or_without_msg(tmp_path: Path, name: str) -> None:
     with open_recording(recorded(tmp_path / "run.mcap", "ros2msg", MSG, name)) as recording:
         assert recording.topics["/twist"].type == "a_msgs/msg/Twist"
         assert recording.read({"/twist": ["level"]})["/twist"].fields["level"].tolist() == [7]
@@ -112,22 +112,22 @@ def package(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "what"), [(None, "no .msg and no .idl file"), ("float64 = = ;;", "cannot be read")]
+    ("text", "message"), [(None, "no .msg and no .idl file"), ("float64 = = ;;", "cannot be read")]
 )
-def test_a_folder_of_no_use_is_refused(text, what, tmp_path):
+def test_folder_without_valid_definitions_is_rejected(text, message, tmp_path):
     if text is not None:
         (tmp_path / "Bad.msg").write_text(text)
-    with pytest.raises(RecordingError, match=what):
+    with pytest.raises(RecordingError, match=message):
         folder_types(str(tmp_path))
 
 
-def test_more_definitions_than_are_read_are_refused_and_not_cut(tmp_path, monkeypatch):
+def test_too_many_definition_files_are_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr("restock.ingest.decoding.definitions.MAX_FILES", 1)
     with pytest.raises(RecordingError, match="it holds 2 definitions, more than 1"):
         folder_types(str(package(tmp_path)))
 
 
-def test_definitions_are_a_distribution_a_folder_or_a_file(tmp_path):
+def test_definitions_can_be_distribution_folder_or_file(tmp_path):
     folder = package(tmp_path)
     assert choose_definitions(None) == "humble"
     assert choose_definitions("jazzy") == "jazzy"
@@ -139,7 +139,7 @@ def test_definitions_are_a_distribution_a_folder_or_a_file(tmp_path):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
+def test_unknown_type_is_read_with_given_definition(tmp_path, capsys):
     with open_recording(NEATO) as recording:
         assert "--definitions" in str(recording.topics["/bump"].skipped)
     with open_recording(NEATO, definitions=str(package(tmp_path))) as recording:
@@ -150,13 +150,14 @@ def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
-def test_a_car_is_read_by_its_steering_angle(tmp_path):
+def test_ackermann_command_gives_yaw_rate(tmp_path):
     file = tmp_path / "p.toml"
     profile = proposed(RACECAR, file)
     command = profile.inputs.command
-    assert command.topic == "/vesc/low_level/ackermann_cmd"  # of seven, nearest to the motor
+    # the nearest to the motor of seven command topics
+    assert command.topic == "/vesc/low_level/ackermann_cmd"
     assert command.wheelbase_m is not None
-    # One with more than zeros in it, tick by tick as one would write it down.
+    # A topic with nonzero commands, with the rates computed one by one.
     text = file.read_text().replace(command.topic + '"', '/vesc/high_level/ackermann_cmd"')
     file.write_text(text)
     profile = load_profile(file)

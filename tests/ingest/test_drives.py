@@ -1,4 +1,4 @@
-"""Several drives of one kind of robot: which are of a kind, and one profile for all of them."""
+"""Several drives of one kind of robot: grouping by kind, and one profile for all of them."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,8 +37,8 @@ DESCRIBED = (
 
 
 @dataclass
-class Told(Drive):
-    """A drive without goals, told to drive at a speed, seen by a lidar of so many beams."""
+class ConfiguredDrive(Drive):
+    """Drive without goals, at a commanded speed, seen by a lidar with this many beams."""
 
     speed_mps: float = 0.4
     every_s: float = PERIOD_S
@@ -46,50 +46,50 @@ class Told(Drive):
     description: str | None = None
 
     def topics(self):
-        found = super().topics()
+        typed = super().topics()
         ticks = np.arange(0, self.duration_s, self.every_s)
         turned = np.zeros(len(ticks))
         reported = {"linear.x": np.full(len(ticks), self.speed_mps), "angular.z": turned}
-        found["/cmd_vel"] = columns(ticks + 0.005, reported, stamped=False)
+        typed["/cmd_vel"] = columns(ticks + 0.005, reported, stamped=False)
         tenth = np.arange(0, self.duration_s, 0.1)
-        found["/scan"] = columns(tenth, scans(np.full((len(tenth), self.beams), FREE_M)))
+        typed["/scan"] = columns(tenth, scans(np.full((len(tenth), self.beams), FREE_M)))
         for topic in ("/goal_pose", "/plan", "/bumper"):
-            del found[topic]
+            del typed[topic]
         if self.description is not None:
             text = {"data": np.array([self.description], object)}
-            found["/robot_description"] = columns(np.array([0.01]), text, stamped=False)
-        return found
+            typed["/robot_description"] = columns(np.array([0.01]), text, stamped=False)
+        return typed
 
 
 @pytest.mark.long
-def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, shell):
+def test_profile_merges_traits_of_several_drives(tmp_path, shell):
     drives = {
-        "slow": Told(duration_s=12.0, speed_mps=0.2),
-        "fast": Told(duration_s=9.0, speed_mps=0.7, every_s=0.1),
-        "described": Told(duration_s=8.0, description=DESCRIBED),
-        "another": Told(duration_s=30.0, speed_mps=2.0, beams=360),
+        "slow": ConfiguredDrive(duration_s=12.0, speed_mps=0.2),
+        "fast": ConfiguredDrive(duration_s=9.0, speed_mps=0.7, every_s=0.1),
+        "described": ConfiguredDrive(duration_s=8.0, description=DESCRIBED),
+        "another": ConfiguredDrive(duration_s=30.0, speed_mps=2.0, beams=360),
     }
     for name, drive in drives.items():
         write_bag(drive, tmp_path / "bags" / name)
     file = tmp_path / "trolley.toml"
-    said = shell.json("profile", "new", tmp_path / "bags", "--out", file)
+    proposal = shell.json("profile", "new", tmp_path / "bags", "--out", file)
     profile = load_profile(str(file))
-    # The fastest command is of one drive, the outline and the wheels of another.
+    # The fastest command comes from one drive, the outline and the wheels from another.
     assert max(speed for speed, _ in profile.task.actions) == pytest.approx(0.7)
     assert (profile.task.body.length_m, profile.task.body.width_m) == (0.7, 0.45)
     assert profile.robot is not None
     assert profile.robot.wheel_radius_m == 0.05
-    # Drives whose commands are of another pace share a tick every period.
+    # Drives with different command rates get ticks at a fixed period.
     assert profile.clock.steps == "rate"
-    assert any("bags/another" in each["text"] for each in said["advice"])
+    assert any("bags/another" in item["text"] for item in proposal["advice"])
     assert "# not of that kind: bags/another: lidar" in file.read_text()
-    # And it makes rows of all three.
+    # The profile gives rows of all three.
     store = tmp_path / "store"
     bags = [str(tmp_path / "bags" / name) for name in ("slow", "fast", "described")]
-    again = shell.json("ingest", *bags, "--profile", file, "--store", store, code={0, 3})
-    rows = [one["transitions"] for one in again["recordings"]]
+    ingested = shell.json("ingest", *bags, "--profile", file, "--store", store, code={0, 3})
+    rows = [recording["transitions"] for recording in ingested["recordings"]]
     assert all(rows)
-    assert sum(rows) == said["transitions"]
+    assert sum(rows) == proposal["transitions"]
 
 
 def traits(**reported) -> RobotTraits:
@@ -100,21 +100,23 @@ def traits(**reported) -> RobotTraits:
 LIDAR = Lidar("laser", 360, 12.0, simulated=False)
 
 
-def test_what_disagrees_is_another_kind():
-    robots = [
+def test_disagreeing_traits_are_different_kinds():
+    robots_ = [
         traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR),
-        traits(command=TWIST, lidar=replace(LIDAR, beams=351)),  # it turns at its own pace
+        # beams differ, as the lidar turns at its own pace
+        traits(command=TWIST, lidar=replace(LIDAR, beams=351)),
         traits(command=TWIST, lidar=replace(LIDAR, beams=720)),
         traits(command=TWIST, lidar=replace(LIDAR, simulated=True)),
         traits(command="ackermann_msgs/msg/AckermannDrive", lidar=LIDAR),
         traits(command=TWIST, frames="odom -> base_footprint", lidar=LIDAR),
     ]
-    assert robot_kinds(robots) == [[0], [1], [2], [3], [4], [5]]
-    # Without the one of other frames nothing contradicts: the two of the same lidar are of a kind.
-    assert robot_kinds(robots[:5]) == [[0, 1], [2], [3], [4]]
+    assert robot_kinds(robots_) == [[0], [1], [2], [3], [4], [5]]
+    # Without the robot of other frames nothing contradicts: the two with the same lidar are one
+    # kind.
+    assert robot_kinds(robots_[:5]) == [[0, 1], [2], [3], [4]]
 
 
-def test_the_usual_names_alone_tell_of_no_kind():
+def test_common_topic_names_do_not_define_a_kind():
     usual = {"command": TWIST, "frames": "odom -> base_link"}
     inputs = frozenset({("/cmd_vel", TWIST)})
     topics = inputs | {("/status", "mine/msg/Status")}
@@ -127,22 +129,26 @@ def test_the_usual_names_alone_tell_of_no_kind():
     assert robot_kinds(robots) == [[0], [1], [2, 3]]
 
 
-def test_what_was_read_and_what_not_is_told(tmp_path, monkeypatch, shell):
+def test_read_and_unread_recordings_are_listed(tmp_path, monkeypatch, shell):
     monkeypatch.setattr(drives_module, "drives_by_kind", partial(drives_by_kind, most=2))
-    for name, drive in (("a", Told(9.0)), ("b", Told(4.0)), ("c", Told(8.0))):
+    for name, drive in (
+        ("a", ConfiguredDrive(9.0)),
+        ("b", ConfiguredDrive(4.0)),
+        ("c", ConfiguredDrive(8.0)),
+    ):
         write_bag(drive, tmp_path / "bags" / name)
-    write_bag(Told(3.0, beams=40), tmp_path / "bags" / "other")
-    said = shell.json("profile", "new", tmp_path / "bags")
+    write_bag(ConfiguredDrive(3.0, beams=40), tmp_path / "bags" / "other")
+    proposal = shell.json("profile", "new", tmp_path / "bags")
     a, b, c, other = (str(tmp_path / "bags" / name) for name in ("a", "b", "c", "other"))
-    assert (said["read"], said["unread"]) == ([a, c], [b])
-    assert [kind["recordings"] for kind in said["kinds"]] == [[a, b, c], [other]]
-    assert "# not read, of that kind: bags/b\n" in said["toml"]
-    assert "# not of that kind: bags/other: lidar" in said["toml"]
+    assert (proposal["read"], proposal["unread"]) == ([a, c], [b])
+    assert [kind["recordings"] for kind in proposal["kinds"]] == [[a, b, c], [other]]
+    assert "# not read, of that kind: bags/b\n" in proposal["toml"]
+    assert "# not of that kind: bags/other: lidar" in proposal["toml"]
 
 
 @dataclass
-class Idle(Told):
-    """It stands, and is told to."""
+class IdleDrive(ConfiguredDrive):
+    """Drive that stands still, as commanded."""
 
     speed_mps: float = 0.0
 
@@ -150,18 +156,22 @@ class Idle(Told):
         return 1.0 + 0.0 * time_s
 
 
-def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, shell):
-    """The largest of three drives stood still: the proposal was refused for all of them."""
-    for name, drive in (("a", Told(16.0)), ("b", Told(15.0)), ("idle", Idle(40.0))):
+def test_drive_without_rows_is_not_used_as_base(tmp_path, shell):
+    """The longest of three drives stood still, and the proposal was refused for all of them."""
+    for name, drive in (
+        ("a", ConfiguredDrive(16.0)),
+        ("b", ConfiguredDrive(15.0)),
+        ("idle", IdleDrive(40.0)),
+    ):
         write_bag(drive, tmp_path / "bags" / name)
     file, bags = tmp_path / "robot.toml", str(tmp_path / "bags")
-    said = shell.json("profile", "new", bags, "--out", file, "--hindsight-goals")
-    assert said["read"][0].endswith("bags/a")
-    # Ticks are .2 s apart; the goal's radius is reached a little before its place.
-    assert 79 + 74 - 4 <= said["transitions"] <= 79 + 74
+    proposal = shell.json("profile", "new", bags, "--out", file, "--hindsight-goals")
+    assert proposal["read"][0].endswith("bags/a")
+    # Ticks are 0.2 s apart. The goal's radius is reached a little before its position.
+    assert 79 + 74 - 4 <= proposal["transitions"] <= 79 + 74
     assert "#   bags/idle: 0  (no transition" in file.read_text()
     reported = "1 of 3 recordings give no transition: bags/idle"
-    assert any(reported in each["text"] for each in said["advice"])
+    assert any(reported in item["text"] for item in proposal["advice"])
 
 
 def proposed(*recordings: Recording) -> Proposal:
@@ -171,21 +181,21 @@ def proposed(*recordings: Recording) -> Proposal:
 
 
 @pytest.mark.long
-def test_where_one_drive_has_no_map_odometry_serves_all():
+def test_odometry_is_used_if_a_drive_has_no_map():
     """Of two bags of a TurtleBot 4, one had rows; `restock start` stopped at the other."""
     sample = ROOT / "sample_logs" / "amr_tuesday"
-    with open_recording(sample) as mapped, open_recording(sample) as without:
-        for recording in (mapped, without):
+    with open_recording(sample) as mapped, open_recording(sample) as unmapped:
+        for recording in (mapped, unmapped):
             del recording.topics["/amcl_pose"]
-        of_maps = parse_profile(proposed(mapped, mapped).toml, where="p")
-        assert of_maps.frames is not None
-        assert of_maps.frames.fixed == "map"
-        del without.topics["/tf"]
-        proposal = proposed(mapped, without)
+        map_profile = parse_profile(proposed(mapped, mapped).toml, where="p")
+        assert map_profile.frames is not None
+        assert map_profile.frames.fixed == "map"
+        del unmapped.topics["/tf"]
+        proposal = proposed(mapped, unmapped)
         profile = parse_profile(proposal.toml, where="p")
         assert profile.frames is None
         assert profile.inputs.pose is not None
         assert profile.inputs.pose.topic == "/odom"
-        rows = [try_toml(one, proposal.toml).transitions for one in (mapped, without)]
+        rows = [try_toml(recording, proposal.toml).transitions for recording in (mapped, unmapped)]
         assert min(rows) > 600
         assert sum(rows) == proposal.transitions

@@ -1,4 +1,4 @@
-"""MCAP's other message encodings: JSON, protobuf and ROS 1 become columns as CDR does."""
+"""MCAP's other message encodings: JSON, protobuf and ROS 1 decode to columns as CDR does."""
 
 import json
 from collections.abc import Sequence
@@ -85,7 +85,7 @@ def test_json_with_and_without_a_schema(schema, tmp_path):
     assert np.asarray(stamps[3]).tolist() == [10**9 + 3] * 3
 
 
-def test_json_that_does_not_decode_is_counted_by_reason(tmp_path):
+def test_undecodable_json_is_counted_by_reason(tmp_path):
     good = json.dumps({"x": 1.5, "stamp": {"sec": 1, "nanosec": 2}}).encode()
     bad = {
         b"{": "not JSON",
@@ -109,11 +109,14 @@ def test_json_that_does_not_decode_is_counted_by_reason(tmp_path):
     assert account.decoded == 2
     assert account.expected == account.read == len(payloads)
     assert sum(account.reasons.values()) == len(bad)
-    for says in bad.values():
-        assert any(reason.startswith(says) for reason in account.reasons), (says, account.reasons)
+    for reason_start in bad.values():
+        assert any(reason.startswith(reason_start) for reason in account.reasons), (
+            reason_start,
+            account.reasons,
+        )
 
 
-def test_json_keeps_integers_that_float64_cannot_hold(tmp_path):
+def test_json_keeps_integers_too_large_for_float64(tmp_path):
     payloads = [b'{"big": %d, "small": 3}' % (START_NS + row) for row in range(3)]
     path = write_channels(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
     with open_recording(path) as recording:
@@ -131,19 +134,19 @@ def test_json_keeps_integers_that_float64_cannot_hold(tmp_path):
         (b'{"properties": 7}', 0),
     ],
 )
-def test_json_schemas_may_say_little_or_never_end(schema, leaves):
+def test_json_schema_may_be_incomplete_or_recursive(schema, leaves):
     kind = JsonType("T", "embedded", schema, lambda: [])
     assert len(kind.leaves()) == leaves
 
 
-def test_json_of_very_many_fields_is_refused():
+def test_json_with_too_many_fields_is_rejected():
     wide = json.dumps({str(number): 1 for number in range(30_000)}).encode()
     with pytest.raises(CannotDecode, match="more than 20,000 fields"):
         JsonType("T", "inferred", b"", lambda: [wide]).leaves()
 
 
 @pytest.mark.parametrize("schema", [b"{", b"[" * 100_000, b'{"a": \xff}', b" " * (5 << 20)])
-def test_invalid_json_schemas(schema):
+def test_invalid_json_schema_is_rejected(schema):
     with pytest.raises(CannotDecode, match="its definition"):
         JsonType("T", "embedded", schema, lambda: []).leaves()
 
@@ -154,7 +157,7 @@ F = FieldDescriptorProto
 
 
 def scan_files() -> Files:
-    """Return a Scan message with all kinds of fields, as a recorder would embed it."""
+    """Return a Scan message with all kinds of fields, as a recorder embeds it."""
     file = FileDescriptorProto(name="scan.proto", package="lab", syntax="proto3")
     file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
     scan = file.message_type.add(name="Scan")
@@ -189,7 +192,7 @@ def scan_files() -> Files:
         )
     files = build_file_descriptor_set(timestamp_pb2.Timestamp)
     files.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
-    files.file.insert(0, file)  # before what it depends on: the order is not promised
+    files.file.insert(0, file)  # before its dependencies, as their order is not guaranteed
     return files
 
 
@@ -201,7 +204,7 @@ def scan_class() -> Any:
     return GetMessageClass(pool.FindMessageTypeByName("lab.Scan"))
 
 
-def scan(row: int) -> bytes:
+def scan_payload(row: int) -> bytes:
     made = scan_class()()
     made.timestamp.seconds, made.timestamp.nanos = 1_700_000_000, row
     made.frame_id = "läser"
@@ -221,8 +224,8 @@ def protobuf(payloads: Sequence[bytes]) -> Written:
     return "/scan", "protobuf", "lab.Scan", "protobuf", definition, payloads
 
 
-def test_protobuf(tmp_path):
-    path = write_channels(tmp_path / "p.mcap", protobuf([scan(row) for row in range(4)]))
+def test_protobuf_messages_decode_to_columns(tmp_path):
+    path = write_channels(tmp_path / "p.mcap", protobuf([scan_payload(row) for row in range(4)]))
     with open_recording(path) as recording:
         leaves = recording.leaves("/scan")
         assert leaves == [
@@ -251,10 +254,16 @@ def test_protobuf(tmp_path):
     assert columns["inner.count"].tolist() == [2**63 + row for row in range(4)]
 
 
-def test_protobuf_that_does_not_parse_is_counted(tmp_path):
+def test_undecodable_protobuf_is_counted_by_reason(tmp_path):
     beyond = scan_class()()
     beyond.timestamp.seconds = 2**62
-    payloads = [scan(1), b"\xff\xff", scan(2)[:-1], bytes(beyond.SerializeToString()), scan(3)]
+    payloads = [
+        scan_payload(1),
+        b"\xff\xff",
+        scan_payload(2)[:-1],
+        bytes(beyond.SerializeToString()),
+        scan_payload(3),
+    ]
     path = write_channels(tmp_path / "p.mcap", protobuf(payloads))
     with open_recording(path) as recording:
         columns = recording.read({"/scan": ["timestamp", "mode"]})["/scan"]
@@ -266,36 +275,42 @@ def test_protobuf_that_does_not_parse_is_counted(tmp_path):
     }
 
 
-def broken(change: Any) -> bytes:
+def changed_definition(change: Any) -> bytes:
     files = scan_files()
     change(files)
     return bytes(files.SerializeToString())
 
 
 @pytest.mark.parametrize(
-    ("definition", "says"),
+    ("definition", "message"),
     [
         (b"\xff\xff", "cannot be parsed"),
         (b"", "does not define lab.Scan"),
-        (broken(lambda files: files.file.pop(1)), "cannot be parsed"),
-        (broken(lambda files: files.file[1].dependency.append("scan.proto")), "cannot be parsed"),
-        (broken(lambda files: files.file[0].message_type.pop(0)), "does not define lab.Scan"),
-        (broken(lambda files: files.file[0].message_type[0].field.pop()), None),
+        (changed_definition(lambda files: files.file.pop(1)), "cannot be parsed"),
+        (
+            changed_definition(lambda files: files.file[1].dependency.append("scan.proto")),
+            "cannot be parsed",
+        ),
+        (
+            changed_definition(lambda files: files.file[0].message_type.pop(0)),
+            "does not define lab.Scan",
+        ),
+        (changed_definition(lambda files: files.file[0].message_type[0].field.pop()), None),
         (bytes(5 << 20), "of 5,242,880 bytes is too long"),
     ],
 )
-def test_invalid_protobuf_definitions(definition, says):
-    if says is None:
+def test_invalid_protobuf_definition_is_rejected(definition, message):
+    if message is None:
         assert protobuf_type("lab.Scan", definition).leaves()
         return
-    with pytest.raises(CannotDecode, match=says):
+    with pytest.raises(CannotDecode, match=message):
         protobuf_type("lab.Scan", definition)
 
 
 # -- ROS 1 in MCAP, and what is not supported -----------------------------------------------------
 
 
-def test_ros1_messages_in_mcap(tmp_path):
+def test_ros1_messages_in_mcap_decode_to_columns(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = "geometry_msgs/msg/PointStamped"
     definition, _ = store.generate_msgdef(kind, ros_version=1)

@@ -1,4 +1,4 @@
-"""Where an episode begins and ends, and that every tick is accounted for."""
+"""Start and end of episodes, and the accounting of every tick."""
 
 import msgspec
 import numpy as np
@@ -25,19 +25,19 @@ def episodes_of(topics: dict[str, TopicColumns], **task: object) -> Split:
 
 END = "end of the recording"
 FAR, NEAR = (0.0, 11.0, 1.0), (0.0, 3.0, 1.0)
-# goals as (time, x, y), changes of the task, the episodes, the ticks in none
+# goals as (time, x, y), task changes, expected episodes, ticks outside episodes
 ENDINGS = {
     "the end of the recording": ([FAR], {}, [(0, 29, False, END, False)], {}),
-    # x = 1 + .5 t comes within .4 m of 3 at t = 3.2 s, tick 16.
+    # x = 1 + 0.5 t comes within 0.4 m of 3 at t = 3.2 s, tick 16.
     "the goal": ([NEAR], {}, [(0, 16, True, "goal", False)], {"goal already reached": 13}),
-    # The mission layer sends the next goal at once: judge the tick by the goal before it.
+    # The mission layer sends the next goal at once, so the tick is judged by the previous goal.
     "the goal, and the next one at once": (
         [NEAR, (3.2, 11.0, 1.0)],
         {},
         [(0, 16, True, "goal", True), (16, 29, False, END, False)],
         {},
     ),
-    # It has driven .5 m past by then.
+    # The robot has passed the goal by 0.5 m at that time.
     "the same goal again": (
         [NEAR, (5.0, 3.0, 1.0)],
         {},
@@ -64,13 +64,13 @@ ENDINGS = {
 
 
 @pytest.mark.parametrize("name", ENDINGS)
-def test_an_episode_ends_by(name: str) -> None:
+def test_episode_ending(name: str) -> None:
     goals, task, spans, dropped = ENDINGS[name]
     found = episodes_of(Drive(goals=goals).topics(), **task)
     assert found == Split([EpisodeSpan(*span) for span in spans], dropped)
 
 
-def test_a_lost_plan_ends_the_episode_and_the_tick_is_counted():
+def test_lost_plan_ends_episode_and_drops_ticks():
     topics = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 9.0)]).topics()
     topics["/plan"] = without(topics["/plan"], np.array([True, False]))
     found = episodes_of(topics)
@@ -78,7 +78,7 @@ def test_a_lost_plan_ends_the_episode_and_the_tick_is_counted():
     assert found.dropped == {"plan: for another goal": 20}
 
 
-def test_the_time_limit_truncates():
+def test_time_limit_truncates_episode():
     found = episodes_of(Drive().topics(), time_limit_steps=12)
     assert [(e.first, e.last, e.ended_by) for e in found.episodes] == [
         (0, 12, "time limit"),
@@ -97,13 +97,13 @@ def test_the_time_limit_truncates():
             [(0, 11, True, "bump", False), (16, 29, False, END, False)],
             4,
         ),
-        (  # It scrapes along something, and touches it every half second.
+        (  # The robot scrapes along an obstacle and touches it every half second.
             [FAR],
             lambda time: (time > 2.0) & (time < 4.0) & (time % 0.5 < 0.1),
             [(0, 11, True, "bump", False), (23, 29, False, END, False)],
             11,
         ),
-        (  # On a new goal's tick it begins no episode.
+        (  # A bump on the tick of a new goal begins no episode.
             [FAR, (2.0, 10.0, 1.0)],
             lambda time: time == 2.0,
             [(0, 10, True, "bump", True), (15, 29, False, END, False)],
@@ -111,7 +111,7 @@ def test_the_time_limit_truncates():
         ),
     ],
 )
-def test_a_bump_terminates_where_the_task_says_so(goals, pressed, spans, dropped):
+def test_bump_terminates_episode_if_configured(goals, pressed, spans, dropped):
     topics, time = Drive(goals=goals).topics(), np.arange(0, 6, 0.02)
     topics["/bumper"] = columns(time, {"data": pressed(time)}, stamped=False)
     assert len(episodes_of(topics, bump_terminates=False).episodes) == len(goals)
@@ -120,7 +120,7 @@ def test_a_bump_terminates_where_the_task_says_so(goals, pressed, spans, dropped
     assert found.dropped == {"bumper: pressed within the last 1 s": dropped}
 
 
-def test_a_gap_truncates_on_the_tick_before():
+def test_command_gap_truncates_at_previous_tick():
     topics = Drive().topics()
     time = (topics["/cmd_vel"].log_time_ns - START_NS) * 1e-9
     topics["/cmd_vel"] = without(topics["/cmd_vel"], (time < 2) | (time > 3))
@@ -131,7 +131,7 @@ def test_a_gap_truncates_on_the_tick_before():
     ]
 
 
-def test_stale_ticks_cut_and_are_counted_by_reason():
+def test_stale_ticks_split_episodes_and_are_counted():
     topics = Drive().topics()
     time = (topics["/scan"].log_time_ns - START_NS) * 1e-9
     topics["/scan"] = without(topics["/scan"], (time < 2) | (time > 3.5))
@@ -140,7 +140,7 @@ def test_stale_ticks_cut_and_are_counted_by_reason():
     assert [e.ended_by for e in found.episodes] == ["scan: stale", "end of the recording"]
 
 
-def test_a_clock_jump_truncates():
+def test_clock_jump_truncates_episode():
     topics = Drive().topics()
     for topic in topics.values():
         later = (topic.log_time_ns - START_NS) * 1e-9 > 3
@@ -152,7 +152,7 @@ def test_a_clock_jump_truncates():
 
 
 @pytest.mark.parametrize("alone", [True, False])
-def test_a_lone_tick_is_no_episode(alone):
+def test_single_tick_between_gaps_is_dropped(alone):
     topics = Drive().topics()
     ticks = 0.005 + np.array([0.0, 0.2, 2.0, 2.2 if not alone else 4.0])
     topics["/cmd_vel"] = columns(
@@ -175,14 +175,14 @@ def test_a_lone_tick_is_no_episode(alone):
     limit=st.integers(2, 40),
     bad=st.lists(st.integers(0, 299), max_size=3),
 )
-def test_every_tick_is_a_transition_or_an_end_or_dropped_by_name(goals, lost, limit, bad):
+def test_every_tick_is_accounted_for(goals, lost, limit, bad):
     topics = Drive(goals=[(0.0, 4.0, 1.0), *goals]).topics()
     for name, (start, length) in lost.items():
         time = (topics[name].log_time_ns - START_NS) * 1e-9
         topics[name] = without(topics[name], (time < start) | (time > start + length))
     if len(topics["/odom"]) > max(bad, default=0):
         topics["/odom"].fields["twist.twist.linear.x"][bad] = np.nan
-    found = episodes_of(topics, time_limit_steps=limit)  # which checks the sum
+    found = episodes_of(topics, time_limit_steps=limit)  # episodes_of() checks the sum
     for before, after in zip(found.episodes, found.episodes[1:], strict=False):
         assert after.first >= before.last if before.shared else after.first > before.last
     assert all(0 < e.last - e.first <= limit for e in found.episodes)

@@ -1,4 +1,4 @@
-"""Poses by satellite fixes: metres east and north, no pose without a fix, and a causal heading."""
+"""Poses from satellite fixes: metres east and north, invalid fixes, and a causal heading."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ RATE_S = 0.1
 
 
 def degrees(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Latitude and longitude of places near the origin, by the radii of curvature there."""
+    """Return latitude and longitude of positions near the origin, by its radii of curvature."""
     phi, squared = np.radians(ORIGIN[0]), FLATTENING * (2 - FLATTENING)
     bend = 1 - squared * np.sin(phi) ** 2
     north_m, east_m = AXIS_M * (1 - squared) / bend**1.5, AXIS_M / np.sqrt(bend)
@@ -34,15 +34,15 @@ def degrees(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drive(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """2 s standing, 10 s east at 1 m/s, then a circle of 4 m radius to the left: x, y and yaw."""
+    """Return x, y and yaw: 2 s standing, 10 s east at 1 m/s, then a left circle of 4 m radius."""
     along = np.clip(time_s - 2, 0, None)
     turned = np.clip(along - 10, 0, None) / 4
     x = np.minimum(along, 10) + 4 * np.sin(turned)
     return x, 4 * (1 - np.cos(turned)), turned
 
 
-def recorded(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> Path:
-    """Return a bag of commands and fixes: those from 8 s to 9 s are invalid, and one is poor."""
+def write_recording(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> Path:
+    """Return a bag of commands and fixes: invalid from 8 s to 9 s, and inaccurate once."""
     time_s = np.arange(0, seconds, RATE_S)
     x, y, yaw = drive(time_s)
     latitude, longitude = degrees(x, y)
@@ -83,11 +83,11 @@ def recorded(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> P
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recorded(tmp_path_factory.mktemp("fixes") / "bag")
+    return write_recording(tmp_path_factory.mktemp("fixes") / "bag")
 
 
 @pytest.mark.parametrize(
-    ("here", "there", "length_m"),  # on the ellipsoid, by Vincenty's inverse formula (1975)
+    ("origin", "target", "length_m"),  # geodesic lengths by Vincenty's inverse formula (1975)
     [
         ((47.3769, 8.5417), (47.4369, 8.6417), 10_073.025),
         ((-33.45, -70.66), (-33.40, -70.73), 8_551.968),
@@ -95,13 +95,13 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ((1.35, 103.82), (1.42, 103.88), 10_222.368),
     ],
 )
-def test_the_plane_is_as_accurate_as_it_is_said_to_be(here, there, length_m):
-    east, north = local_plane_m(np.array(there[:1]), np.array(there[1:]), here)[0]
+def test_local_plane_matches_geodesic_length(origin, target, length_m):
+    east, north = local_plane_m(np.array(target[:1]), np.array(target[1:]), origin)[0]
     assert np.hypot(east, north) == pytest.approx(length_m, abs=0.006)
-    assert (east > 0, north > 0) == (there[1] > here[1], there[0] > here[0])
+    assert (east > 0, north > 0) == (target[1] > origin[1], target[0] > origin[0])
 
 
-def test_what_is_no_fix_is_no_pose_and_says_why():
+def test_invalid_fixes_give_no_pose_and_a_reason():
     count = 6
     covariance = np.tile(np.diag([1.0, 1.0, 4.0]).ravel(), (count, 1))
     covariance[4] *= 100
@@ -113,29 +113,31 @@ def test_what_is_no_fix_is_no_pose_and_says_why():
         covariance_m2=covariance,
         covariance_type=np.full(count, 2.0),
     )
-    said = ["no fix"] * 3 + [""] + ["fix too uncertain", "no fix"]
-    assert fixes.problems(5.0).tolist() == said
+    expected = ["no fix"] * 3 + [""] + ["fix too uncertain", "no fix"]
+    assert fixes.problems(5.0).tolist() == expected
     assert fixes.problems(50.0)[4] == ""
     assert fixes.origin_deg() == (47.0, 8.0)
     assert np.isnan(fixes.poses().x_m).tolist() == [True, True, True, False, True, True]
 
 
 def plain_track_yaw(x: np.ndarray, y: np.ndarray, track_m: float) -> np.ndarray:
-    """Return the definition, with a look at every earlier position since the last turn."""
+    """Compute the track's yaw by searching every earlier position since the last turn."""
     yaw, held, back = np.full(len(x), np.nan), np.nan, 0
-    for here in range(len(x)):
-        far = np.flatnonzero(np.hypot(x[here] - x[: here + 1], y[here] - y[: here + 1]) >= track_m)
+    for index in range(len(x)):
+        far = np.flatnonzero(
+            np.hypot(x[index] - x[: index + 1], y[index] - y[: index + 1]) >= track_m
+        )
         far = far[far >= back]
         if len(far):
             back = int(far[-1])
-            held = np.arctan2(y[here] - y[back], x[here] - x[back])
-        yaw[here] = held
+            held = np.arctan2(y[index] - y[back], x[index] - x[back])
+        yaw[index] = held
     return yaw
 
 
 @pytest.mark.parametrize("scatter_m", [0.0, 0.02, 0.2, 0.5])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_track_equals_that_of_a_full_search(seed, scatter_m):
+def test_track_yaw_equals_full_search(seed, scatter_m):
     rng = np.random.default_rng(seed)
     speeds = np.repeat(rng.choice([0.0, 0.0, 0.05, 0.1, -0.1], 12), rng.integers(1, 120, 12))
     heading = np.cumsum(rng.normal(0, 0.15, len(speeds)))
@@ -144,7 +146,7 @@ def test_the_track_equals_that_of_a_full_search(seed, scatter_m):
     np.testing.assert_array_equal(track_yaw(x, y, 1.0), plain_track_yaw(x, y, 1.0))
 
 
-def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, shell):
+def test_proposal_from_fixes_drops_ticks_without_fix(bag, tmp_path, shell):
     profile, store = tmp_path / "gps.toml", tmp_path / "store"
     assert main(["profile", "new", str(bag), "--out", str(profile)]) in (0, 3)
     text = profile.read_text()
@@ -152,8 +154,8 @@ def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, shell):
     assert f"origin_deg = [{origin[0][0]:.7f}, {origin[1][0]:.7f}]" in text
     assert f'type = "{FIX}"' in text
     (row,) = shell.json("ingest", bag, "--profile", profile, "--store", store)["recordings"]
-    dropped = {one["reason"]: one["count"] for one in row["drops"]}
-    assert dropped["pose: no fix"] == 5  # a second of ticks
+    dropped = {drop["reason"]: drop["count"] for drop in row["drops"]}
+    assert dropped["pose: no fix"] == 5  # one second of ticks
     assert dropped["pose: fix too uncertain"] == 1
     assert dropped["pose: heading unknown until the robot has driven"] >= 10
     with Store(store) as opened:
@@ -166,8 +168,8 @@ def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, shell):
     assert speeds == pytest.approx(np.ones(len(speeds)), abs=0.02)
 
 
-def test_the_heading_of_an_imu_stands_in_for_the_track(tmp_path):
-    bag = recorded(tmp_path / "bag", heading=True)
+def test_imu_heading_replaces_track_heading(tmp_path):
+    bag = write_recording(tmp_path / "bag", heading=True)
     main(["profile", "new", str(bag), "--out", str(tmp_path / "gps.toml")])
     heading = (
         f'[inputs.heading]\ntopic = "/imu"\ntype = "{IMU}"\n'
@@ -176,7 +178,7 @@ def test_the_heading_of_an_imu_stands_in_for_the_track(tmp_path):
     text = (tmp_path / "gps.toml").read_text() + heading
     profile = parse_profile(text, where="gps.toml")
     outcome = ingest(bag, profile, store=StoreWriter(tmp_path / "store"))
-    assert not any("heading" in one["reason"] for one in outcome.manifest["drops"])
+    assert not any("heading" in drop["reason"] for drop in outcome.manifest["drops"])
     with Store(tmp_path / "store") as opened:
         rows = opened.sql("FROM transitions ORDER BY stamp_ns").to_arrow_table()
     at_s = (rows["pose_stamp_ns"].to_numpy() - 1_700_000_000 * 10**9) * 1e-9
@@ -186,7 +188,7 @@ def test_the_heading_of_an_imu_stands_in_for_the_track(tmp_path):
         parse_profile(WAREHOUSE + "\n" + heading, where="warehouse.toml")
 
 
-def test_it_is_not_done_live(bag, tmp_path):
+def test_live_observer_rejects_satellite_fixes(bag, tmp_path):
     main(["profile", "new", str(bag), "--out", str(tmp_path / "gps.toml")])
     with pytest.raises(ConfigError, match="satellite fixes"):
         LiveObserver(load_profile(tmp_path / "gps.toml"))

@@ -1,4 +1,4 @@
-"""A robot's outline from its description, or the command line."""
+"""A robot's outline, from its description or the command line."""
 
 import numpy as np
 import pytest
@@ -34,18 +34,18 @@ URDF = """<robot name="cart">
 </robot>"""
 
 
-def test_shapes_of_the_base_and_its_wheels_make_the_outline():
+def test_outline_covers_base_and_wheels():
     found = of_urdf(RobotText("/robot_description", URDF), "lidar")
     assert not isinstance(found, str)
-    # The box from -.2 to .4 ahead; .2 m to the right of the middle, the wheel to .28 m on the left.
+    # The box reaches from -0.2 to 0.4 m ahead and 0.2 m to the right; the left wheel to 0.28 m.
     assert (found.length_m, found.width_m) == pytest.approx((0.6, 0.48))
-    assert found.lidar_x_m == pytest.approx(0.3 - 0.1)  # ahead of the box's middle
+    assert found.lidar_x_m == pytest.approx(0.3 - 0.1)  # relative to the middle of the outline
     assert abs(found.lidar_yaw_rad or 0) == pytest.approx(np.pi)
     assert found.source == "shapes of 2 links in /robot_description"
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "message"),
     [
         ("<robot", "is not XML"),
         ("<robot><link name='x'/><link name='y'/></robot>", "none of the links base_link"),
@@ -53,13 +53,13 @@ def test_shapes_of_the_base_and_its_wheels_make_the_outline():
         (URDF.replace("0.6 0.4 0.3", "nan 1e400 x"), "a mesh's size"),
     ],
 )
-def test_a_description_of_no_use_is_said_to_be_one(text, why):
+def test_unusable_description_is_reported(text, message):
     found = of_urdf(RobotText("/robot_description", text))
     assert isinstance(found, str)
-    assert why in found
+    assert message in found
 
 
-def test_a_footprint_on_the_command_line():
+def test_parse_footprint():
     found = parse_footprint("0.281x0.306")
     assert (found.length_m, found.width_m) == (0.281, 0.306)
     for text in ("0.3", "1.2.3x4", "0x1", "900x1", "-1x1"):
@@ -76,7 +76,7 @@ def test_a_footprint_on_the_command_line():
         ("sim-time-husky", 0.990, 0.670),
     ],
 )
-def test_outlines_are_those_of_the_makers(bag, length_m, width_m):
+def test_outlines_match_manufacturer_data(bag, length_m, width_m):
     with open_recording(SHARED / bag) as recording:
         found, notes = footprint_of(descriptions(recording), "base_scan")
     assert found is not None

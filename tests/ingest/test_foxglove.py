@@ -1,4 +1,4 @@
-"""Robots that record Foxglove's message types, and ROS's, as JSON or protobuf: what is proposed."""
+"""Robots that record Foxglove or ROS message types as JSON or protobuf: proposed profiles."""
 
 from pathlib import Path
 from typing import Any
@@ -28,14 +28,14 @@ from restock.ingest.propose.drives import robot_traits
 
 
 def proposed(shell: Shell, path: Path) -> str:
-    """Return the proposal's TOML, which is usable."""
-    said = shell.json("profile", "new", path)
-    assert said["problems"] == []
-    return str(said["toml"])
+    """Return the TOML of the proposal, after checking that it is usable."""
+    proposal = shell.json("profile", "new", path)
+    assert proposal["problems"] == []
+    return str(proposal["toml"])
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encoding, shell):
+def test_scan_pose_odometry_and_command_are_proposed(tmp_path, encoding, shell):
     path = write_robot(tmp_path / "run.mcap", encoding, drive())
     profile = parse_profile(proposed(shell, path), where="p")
     steps = steps_in(path, profile)
@@ -52,7 +52,7 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encod
     seconds = (steps.signals["stamp_ns"][usable] - START_NS) * 1e-9
     expected = np.array([place(time_s) for time_s in seconds.tolist()])
     for name, column in (("pose_x_m", expected[:, 0]), ("pose_y_m", expected[:, 1])):
-        # A pose is at most a period, and the time it took to be logged, old.
+        # A pose is at most one period plus its logging delay old.
         assert np.abs(steps.signals[name][usable] - column).max() < 0.1 * SPEED_MPS
     assert np.allclose(steps.signals["command_yaw_rate_radps"][usable], YAW_RATE_RADPS)
     ahead_m = steps.signals["sector_clearance_m"][usable].min(axis=1)
@@ -63,11 +63,15 @@ def test_a_robots_scans_poses_odometry_and_commands_are_proposed(tmp_path, encod
     assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
 
 
-def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, shell):
-    messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
+def test_fixes_are_proposed_without_other_poses(tmp_path, shell):
+    messages: list[Message] = [
+        message for message in drive() if message[1] in ("/cmd_vel", "/scan")
+    ]
     for time_s in np.arange(0, 20, 0.2).tolist():
         messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
-    path = write_robot(tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda one: one[0]))
+    path = write_robot(
+        tmp_path / "run.mcap", "protobuf", sorted(messages, key=lambda message: message[0])
+    )
     toml = proposed(shell, path)
     assert "Fixes of 0.02 m, mostly" in toml
     assert parse_profile(toml, where="p").inputs.pose.topic == "/gps/fix"
@@ -79,7 +83,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(tmp_path, shell):
     assert np.allclose(np.hypot(x, y - radius), radius, atol=0.02)
 
 
-def test_goals_and_plans_are_not_taken_for_poses(tmp_path, shell):
+def test_goals_and_plans_are_not_proposed_as_poses(tmp_path, shell):
     at = {"timestamp": 0.0, "frame_id": "map"}
     plan = {**at, "poses": [pose(), pose(2.0, 2.0)]}
     messages: list[Message] = [
@@ -94,26 +98,30 @@ def test_goals_and_plans_are_not_taken_for_poses(tmp_path, shell):
 
 
 @pytest.mark.parametrize(("encoding", "together"), [("json", True), ("protobuf", False)])
-def test_poses_and_the_lidars_place_are_by_transforms(tmp_path, encoding, together, shell):
-    def between(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
+def test_pose_and_lidar_mounting_from_transforms(tmp_path, encoding, together, shell):
+    def transform(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
         where = pose(*at)
         return {
             **{"timestamp": time_s, "parent_frame_id": parent, "child_frame_id": child},
             **{"translation": where["position"], "rotation": where["orientation"]},
         }
 
-    messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
+    messages: list[Message] = [
+        message for message in drive() if message[1] in ("/cmd_vel", "/scan")
+    ]
     for time_s in np.arange(0, 20, 0.05).tolist():
         links = [
-            between(time_s, "map", "odom", (1.0, 0.0)),
-            between(time_s, "odom", "base_link", place(time_s)),
-            between(time_s, "base_link", "laser", (0.2, 0.0, np.pi)),
+            transform(time_s, "map", "odom", (1.0, 0.0)),
+            transform(time_s, "odom", "base_link", place(time_s)),
+            transform(time_s, "base_link", "laser", (0.2, 0.0, np.pi)),
         ]
         if together:
             messages.append((time_s, "/tf", "foxglove.FrameTransforms", {"transforms": links}))
         else:
-            messages += [(time_s, "/moves", "foxglove.FrameTransform", one) for one in links]
-    path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
+            messages += [(time_s, "/moves", "foxglove.FrameTransform", link) for link in links]
+    path = write_robot(
+        tmp_path / "run.mcap", encoding, sorted(messages, key=lambda message: message[0])
+    )
     profile = parse_profile(proposed(shell, path), where="p")
     steps = steps_in(path, profile)
     assert profile.inputs.pose is None

@@ -1,4 +1,4 @@
-"""Poses through /tf and /tf_static: hand values, holds, changes of the tree, what is missing."""
+"""Poses through /tf and /tf_static: hand values, holds, changed trees, missing transforms."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ Line = tuple[float, str, str, float, float, float, float]
 def transforms(
     lines: list[Line], *, latency_s: float = 0.002, ahead_s: float = 0.0
 ) -> TopicColumns:
-    """Return a topic of one transform a message, in the order of the lines."""
-    one = offsets_of(np.ones(len(lines), np.int64))
+    """Return a topic with one transform per message, in the order of the lines."""
+    each_single = offsets_of(np.ones(len(lines), np.int64))
     stamp = START_NS + np.rint(np.array([line[0] for line in lines]) * 1e9).astype(np.int64)
     half = np.array([line[6] for line in lines]) / 2
     values = {
@@ -41,13 +41,15 @@ def transforms(
         "transform.rotation.z": np.sin(half),
         "transform.rotation.w": np.cos(half),
     }  # fmt: skip
-    fields = {f"transforms[].{path}": Ragged(column, one) for path, column in values.items()}
+    fields = {
+        f"transforms[].{path}": Ragged(column, each_single) for path, column in values.items()
+    }
     assert set(fields) == set(FIELDS)
     log = stamp + round(latency_s * 1e9)
     return TopicColumns(log, log, fields)
 
 
-def tree_of(frames: Frames, moving: list[Line], still: list[Line], **how: float) -> Tree:
+def build_tree(frames: Frames, moving: list[Line], still: list[Line], **how: float) -> Tree:
     topics = {"/tf_static": transforms(still)}
     if moving:
         topics["/tf"] = transforms(moving, **how)
@@ -62,9 +64,9 @@ def at(*seconds: float) -> list[np.ndarray]:
     return [START_NS + np.rint(np.array(seconds) * 1e9).astype(np.int64)]
 
 
-def test_a_chain_by_hand():
-    """Odom is at (10, 0) turned left, the robot at (2, 1) in it, its body .5 m ahead."""
-    tree = tree_of(
+def test_chain_of_transforms_by_hand():
+    """Odom is at (10, 0) turned left, the robot at (2, 1) in odom, its body 0.5 m ahead."""
+    tree = build_tree(
         Frames(base="body"),
         [(0.0, "map", "odom", 10, 0, 0, np.pi / 2), (0.0, "odom", "base_link", 2, 1, 0, 0.0)],
         [(0.0, "base_link", "body", 0.5, 0, 0.2, 0.0)],
@@ -75,19 +77,19 @@ def test_a_chain_by_hand():
     assert found.yaw_rad[0] == pytest.approx(np.pi / 2)
 
 
-def test_the_way_down_is_the_way_up_backwards():
-    """The fixed frame may lie below the other: the inverse by hand."""
+def test_inverse_transform_by_hand():
+    """The fixed frame may lie below the other frame in the tree."""
     lines: list[Line] = [
         (0.0, "odom", "map", 1, 2, 0, np.pi / 2),
         (0.0, "odom", "base", 1, 5, 0, 0),
     ]
-    found = tree_of(Frames(base="base"), lines, []).place("base", at(0.1))
-    # 3 m along odom's y from the map's origin is 3 m along the map's x.
+    found = build_tree(Frames(base="base"), lines, []).place("base", at(0.1))
+    # 3 m along y of odom, from the map's origin, is 3 m along x of the map.
     assert found.translation_m[0] == pytest.approx([3.0, 0.0, 0.0])
     assert found.yaw_rad[0] == pytest.approx(-np.pi / 2)
 
 
-def test_rotations_are_those_of_the_quaternions():
+def test_rotations_match_quaternions():
     rng = np.random.default_rng(5)
     quaternion = rng.normal(size=(4, 50))
     found = rotations(*quaternion)
@@ -100,24 +102,24 @@ def test_rotations_are_those_of_the_quaternions():
     assert np.isnan(rotations(*np.zeros((4, 1)))).all()
 
 
-def test_each_transform_is_held_from_when_it_was_measured_on():
+def test_transforms_are_held_from_their_stamp():
     moving: list[Line] = [(0.0, "map", "odom", 0, 0, 0, 0)]
     moving += [(t, "odom", "base_link", t, 0, 0, 0) for t in (0.0, 0.1, 0.2, 0.3)]
-    tree = tree_of(Frames(max_age_s=1.0), moving, [])
+    tree = build_tree(Frames(max_age_s=1.0), moving, [])
     found = tree.place("base_link", at(-0.05, 0.0, 0.15, 0.29, 0.3, 1.0, 1.29, 1.31))
     assert found.translation_m[1:5, 0] == pytest.approx([0.0, 0.1, 0.2, 0.3])
     assert found.problem[0] == "no transform from map to base_link yet"
-    assert found.problem[5] == ""  # of map -> odom, a second old
+    assert found.problem[5] == ""  # map -> odom is one second old
     assert found.problem[6] == "transform map -> odom: stale"
     assert set(found.problem[1:5]) == {""}
-    assert found.stamp_ns[2] == START_NS + NS // 10  # of the newest on the way
+    assert found.stamp_ns[2] == START_NS + NS // 10  # stamp of the newest transform of the chain
 
 
-def test_only_static_transforms_hold_across_a_clock_jump():
+def test_only_static_transforms_hold_across_clock_jump():
     log = np.arange(0, 10, 0.1)
     clock = columns(log, {})
     later = log >= 5
-    clock.fields["header.stamp"][later] -= 100 * NS  # set back while it recorded
+    clock.fields["header.stamp"][later] -= 100 * NS  # the clock is set back during the recording
     topics = {
         "/tf": transforms([(1.0, "map", "odom", 7, 0, 0, 0)]),
         "/tf_static": transforms([(-600.0, "odom", "base_link", 1, 0, 0, 0)]),
@@ -134,34 +136,34 @@ def test_only_static_transforms_hold_across_a_clock_jump():
     assert found.translation_m[0, 0] == 8.0
 
 
-def test_a_transform_ahead_counts_from_its_reception():
-    """As localisation stamps map -> odom; it says nothing about the recording's clocks either."""
+def test_transform_with_future_stamp_counts_from_reception():
+    """Localisation stamps map -> odom ahead, which must not affect the clock offset either."""
     moving: list[Line] = [(t, "map", "base_link", t, 0, 0, 0) for t in np.arange(0, 5, 0.5)]
-    tree = tree_of(Frames(), moving, [], ahead_s=1.0)
+    tree = build_tree(Frames(), moving, [], ahead_s=1.0)
     found = tree.place("base_link", at(0.1, 1.01, 2.6))
     assert found.translation_m[:, 0].tolist() == [0.0, 1.0, 2.5]
     assert tree.segments[0].clock_map.offset_ns == 2_000_000
 
 
-def test_a_frame_with_a_new_parent_is_followed():
+def test_frame_with_new_parent_is_followed():
     moving: list[Line] = [
         (0.0, "map", "odom", 5, 0, 0, 0),
         (0.0, "map", "lift", 100, 0, 0, 0),
         *((t, "odom" if t < 1 else "lift", "base_link", 1, 0, 0, 0) for t in (0.0, 0.9, 1.0, 1.9)),
     ]
-    tree = tree_of(Frames(max_age_s=5), moving, [])
+    tree = build_tree(Frames(max_age_s=5), moving, [])
     assert tree.edges.parent_changes == 1
     assert tree.place("base_link", at(0.5, 1.5)).translation_m[:, 0].tolist() == [6.0, 101.0]
 
 
-def test_a_loop_ends():
+def test_loop_of_frames_terminates():
     moving: list[Line] = [(0.0, "a", "base_link", 1, 0, 0, 0), (0.0, "base_link", "a", 1, 0, 0, 0)]
-    assert "no transform" in tree_of(Frames(), moving, []).place("base_link", at(0.1)).problem[0]
+    assert "no transform" in build_tree(Frames(), moving, []).place("base_link", at(0.1)).problem[0]
 
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(*[st.sampled_from(["map", "/map", "odom", "/odom", "arm"])] * 2)))
-def test_each_frame_has_its_own_transforms_in_their_order(pairs: list[tuple[str, str]]) -> None:
+def test_transforms_are_grouped_by_frame_in_order(pairs: list[tuple[str, str]]) -> None:
     lines: list[Line] = [(0.1 * n, *pair, n, 0, 0, 0) for n, pair in enumerate(pairs)]
     edges = Edges.of(Frames(), {"/tf": transforms(lines)})
     names = {child.strip("/") for _, child in pairs}
@@ -173,7 +175,7 @@ def test_each_frame_has_its_own_transforms_in_their_order(pairs: list[tuple[str,
         assert fields["parent"].tolist() == [pairs[n][0].strip("/") for n in own]
 
 
-def test_a_quaternion_of_no_length_is_not_finite():
+def test_zero_quaternion_is_reported_as_not_finite():
     topic = transforms([(0.0, "map", "base_link", 3, 0, 0, 0)])
     topic.fields["transforms[].transform.rotation.w"].values[:] = 0
     edges = Edges.of(Frames(), {"/tf": topic})
@@ -189,7 +191,7 @@ def test_a_quaternion_of_no_length_is_not_finite():
 
 
 def drive_with_transforms(drive: Drive, *, until_s: float = 99.0) -> dict[str, TopicColumns]:
-    """Return the drive with map -> odom -> base_link at 10 Hz; odom is turned half round."""
+    """Return the drive with map -> odom -> base_link at 10 Hz and odom turned by half a turn."""
     times = [t for t in np.arange(0, drive.duration_s, 0.1).tolist() if t < until_s]
     lines: list[Line] = []
     for t in times:
@@ -198,19 +200,20 @@ def drive_with_transforms(drive: Drive, *, until_s: float = 99.0) -> dict[str, T
     return drive.topics() | {"/tf": transforms(lines)}
 
 
-def test_steps_from_transforms_are_those_from_the_pose_topic():
+def test_steps_from_transforms_match_pose_topic():
     drive = Drive()
     topics = drive_with_transforms(drive)
     by_topic = steps_of(load_profile("warehouse_amr"), topics)
     del topics["/amcl_pose"]
     by_frames = steps_of(parse_profile(framed(), where="p"), topics)
-    for name in by_topic.signals.keys() - {"clearance_ahead_m"}:  # on the edge of two sectors
+    # differs at the border of two sectors
+    for name in by_topic.signals.keys() - {"clearance_ahead_m"}:
         column = by_topic.signals[name]
         assert by_frames.signals[name] == pytest.approx(column, abs=1e-9, nan_ok=True), name
     assert by_frames.problem == by_topic.problem
 
 
-def test_stale_transforms_make_ticks_unusable_and_name_the_edge():
+def test_stale_transform_drops_ticks_and_is_named():
     steps = steps_of(
         parse_profile(framed(), where="p"), drive_with_transforms(Drive(), until_s=3.0)
     )
@@ -219,7 +222,7 @@ def test_stale_transforms_make_ticks_unusable_and_name_the_edge():
     assert reasons == steps.problem[-len(reasons) :]
 
 
-def test_missing_transforms_are_named():
+def test_missing_transform_is_reported():
     topics = Drive().topics()
     del topics["/amcl_pose"]
     topics["/tf"] = transforms([(0.0, "odom", "base_footprint", 0, 0, 0, 0)])
@@ -229,7 +232,7 @@ def test_missing_transforms_are_named():
     assert "there are odom -> base_footprint" in str(error.value)
 
 
-def test_goals_and_plans_are_put_in_the_fixed_frame():
+def test_goals_and_plans_are_transformed_to_fixed_frame():
     drive = Drive()
     topics = drive_with_transforms(drive)
     usual = steps_of(parse_profile(framed(), where="p"), topics)
@@ -238,7 +241,7 @@ def test_goals_and_plans_are_put_in_the_fixed_frame():
         for axis in "xy":
             path = next(p for p in fields if p.endswith(f"position.{axis}"))
             column = fields[path]
-            offset = 20.0 if axis == "x" else 0.0  # odom's origin, and half a turn
+            offset = 20.0 if axis == "x" else 0.0  # odom's origin, turned by half a turn
             fields[path] = (
                 Ragged(offset - np.asarray(column.values), column.offsets)
                 if isinstance(column, Ragged)
@@ -249,20 +252,20 @@ def test_goals_and_plans_are_put_in_the_fixed_frame():
             topics[topic].log_time_ns, topics[topic].publish_time_ns, fields
         )
     moved = steps_of(parse_profile(framed(), where="p"), topics)
-    # The transform at the goal's own time is held: a tenth of a second's worth of difference none.
+    # The transform at the goal's own time is held, so there is no difference from its age.
     for name in ("goal_distance_m", "route_remaining_m", "waypoint_near_x_m"):
         assert moved.signals[name] == pytest.approx(usual.signals[name], abs=1e-9), name
     assert moved.route_problem == usual.route_problem
 
 
-def test_a_goal_in_a_frame_that_nothing_joins_is_no_goal():
+def test_goal_in_unconnected_frame_is_ignored():
     topics = drive_with_transforms(Drive())
     topics["/goal_pose"].fields["header.frame_id"] = np.array(["dock", None], object)[:-1]
     steps = steps_of(parse_profile(framed(), where="p"), topics)
     assert set(steps.route_problem) == {"goal: no transform from map to dock yet"}
 
 
-def test_frames_that_differ_without_transforms_are_said():
+def test_differing_frames_without_transforms_are_noted():
     topics = Drive().topics()
     for topic, frame in (("/goal_pose", "map"), ("/plan", "odom")):
         topics[topic].fields["header.frame_id"] = np.array([frame, None], object)[:-1]
@@ -271,7 +274,7 @@ def test_frames_that_differ_without_transforms_are_said():
 
 
 @pytest.mark.parametrize(
-    ("frames", "said"),
+    ("frames", "message"),
     [
         ('[frames]\nbase = "map"\n[clock]', "fixed and base are the same frame"),
         ("[frames]\nmax_age_s = 0\n[clock]", "max_age_s must be above 0"),
@@ -279,30 +282,30 @@ def test_frames_that_differ_without_transforms_are_said():
         ("[clock]", "`inputs.pose` is missing, and so is `frames`"),
     ],
 )
-def test_what_a_profile_may_not_say_of_frames(frames, said):
+def test_invalid_frames_table_is_rejected(frames, message):
     with pytest.raises(ConfigError) as error:
         parse_profile(framed(frames=frames), where="p")
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("topic", "said"),
+    ("topic", "message"),
     [
         ("/odom", "/odom holds nav_msgs/msg/Odometry, not transforms (frames)"),
         ("/tff", "no message of /tff or /tff (pose, by [frames])"),
     ],
 )
-def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, shell):
+def test_wrong_transform_topic_is_reported(topic, message, tmp_path, shell):
     profile = tmp_path / "p.toml"
     frames = f'[frames]\ntopic = "{topic}"\nstatic_topic = "{topic}"\n[clock]'
     profile.write_text(framed(frames=frames))
-    assert said in shell.err("profile", "check", profile, SAMPLE)
+    assert message in shell.err("profile", "check", profile, SAMPLE)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize("bag", ["turtlebot3-sim-humble", "turtlebot3-sim-sparse-cmd"])
-def test_transforms_of_a_turtlebot_agree_with_its_odometry(bag):
-    """odom -> base_footprint says what /odom says, by both clocks; base_link is 1 cm above it."""
+def test_turtlebot_transforms_match_odometry(bag):
+    """odom -> base_footprint equals /odom, on both clocks; base_link is 1 cm above it."""
     from restock.ingest.containers.open_recording import open_recording
 
     pose = [f"pose.pose.position.{axis}" for axis in "xyz"]
@@ -321,15 +324,15 @@ def test_transforms_of_a_turtlebot_agree_with_its_odometry(bag):
     found = Tree(frames, edges, segments).place("base_link", [times])
     known = found.problem == ""
     assert known.sum() > 0.95 * len(times)
-    said = np.stack([np.asarray(read["/odom"].fields[path]) for path in pose], axis=1)
-    assert found.translation_m[known, :2] == pytest.approx(said[known, :2], abs=1e-3)
-    assert found.translation_m[known, 2] - said[known, 2] == pytest.approx(0.01, abs=1e-3)
+    odometry_m = np.stack([np.asarray(read["/odom"].fields[path]) for path in pose], axis=1)
+    assert found.translation_m[known, :2] == pytest.approx(odometry_m[known, :2], abs=1e-3)
+    assert found.translation_m[known, 2] - odometry_m[known, 2] == pytest.approx(0.01, abs=1e-3)
     x, y, z, w = (np.asarray(read["/odom"].fields[path])[known] for path in turn)
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     assert np.abs(np.angle(np.exp(1j * (found.yaw_rad[known] - yaw)))).max() < 1e-3
 
 
-def test_a_message_may_hold_many_transforms_or_none():
+def test_message_with_many_transforms_or_none():
     both = transforms([(0.0, "map", "odom", 1, 0, 0, 0), (0.0, "odom", "base_link", 2, 0, 0, 0)])
     fields = {
         path: Ragged(column.values, np.array([0, 2, 2], np.int64))

@@ -1,4 +1,4 @@
-"""How a recording is cut into groups while it is read changes nothing of what comes out."""
+"""The grouping of messages while a recording is read does not change the result."""
 
 import random
 from pathlib import Path
@@ -29,8 +29,8 @@ WHOLE = 1 << 40
 PROFILE = load_profile("warehouse_amr")
 
 
-def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
-    """Cut groups at `size` bytes and batches at `rows` messages."""
+def set_group_sizes(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
+    """Set the size of groups to `size` bytes and of batches to `rows` messages."""
     patch.setattr(mcap_file, "GROUP_BYTES", size)
     patch.setattr(sqlite_file, "BYTES_PER_BATCH", size)
     patch.setattr(reading, "SMALL_ROWS", rows)
@@ -40,7 +40,7 @@ def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
 
 def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        cut_by(patch, size, rows)
+        set_group_sizes(patch, size, rows)
         with open_recording(path, salvage=salvage) as recording:
             columns = recording.read({topic: recording.leaves(topic) for topic in recording.topics})
             return {
@@ -52,7 +52,7 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
 
 
 def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
-    """Return the same messages out of order, as several recorders' buffers leave them."""
+    """Write the same messages out of order, as the buffers of several recorders leave them."""
     with source.open("rb") as file, target.open("wb") as sink:
         messages = list(make_reader(file).iter_messages(log_time_order=False))
         random.Random(seed).shuffle(messages)
@@ -87,10 +87,10 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     chunked=st.booleans(),
     compression=st.sampled_from(list(CompressionType)),
     index=st.sampled_from([IndexType.ALL, IndexType.NONE]),
-    whole=st.one_of(st.none(), st.floats(0.3, 0.99)),
+    kept_share=st.one_of(st.none(), st.floats(0.3, 0.99)),
 )
-def test_any_grouping_of_an_mcap_gives_the_same_columns(
-    tmp_path_factory, sample, chunk_size, size, rows, seed, chunked, compression, index, whole
+def test_mcap_grouping_does_not_change_columns(
+    tmp_path_factory, sample, chunk_size, size, rows, seed, chunked, compression, index, kept_share
 ):
     path = shuffled(
         sample,
@@ -101,16 +101,16 @@ def test_any_grouping_of_an_mcap_gives_the_same_columns(
         compression=compression,
         index_types=index,
     )
-    if whole is not None:
-        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * whole)])
-    expected = read(path, WHOLE, 1, salvage=whole is not None)
-    regrouped = read(path, size, rows, salvage=whole is not None)
+    if kept_share is not None:
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * kept_share)])
+    expected = read(path, WHOLE, 1, salvage=kept_share is not None)
+    regrouped = read(path, size, rows, salvage=kept_share is not None)
     assert_same_columns(expected.pop("columns"), regrouped.pop("columns"))
     assert expected == regrouped
 
 
 @pytest.mark.parametrize("size", [1, 3000, 40_000])
-def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: Path) -> None:
+def test_sqlite_batch_size_does_not_change_columns(size: int, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run", count=60)
     expected = read(bag, WHOLE, 1, salvage=False)
     for salvage in (False, True):
@@ -120,7 +120,7 @@ def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: 
 
 
 @pytest.mark.parametrize("storage", one_in(2, ["mcap", "sqlite3"]))
-def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None:
+def test_grouping_does_not_change_table(storage: str, tmp_path: Path) -> None:
     goals = [(0.0, 3.0, 1.0), (3.2, 4.5, 1.0), (5.5, 20.0, 1.0)]
     drive = Drive(duration_s=8.0, goals=goals, truth="nominal")
     bag = write_drive(drive, tmp_path / "drive", storage=storage)
@@ -128,10 +128,10 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
     for size, rows, group in ((WHOLE, 1, WHOLE), (2000, 3, 1)):
         store = StoreWriter(tmp_path / f"store{len(tables)}")
         with pytest.MonkeyPatch.context() as patch:
-            cut_by(patch, size, rows)
+            set_group_sizes(patch, size, rows)
             patch.setattr(transitions_module, "GROUP_ROWS", group)
-            made = ingest(bag, PROFILE, store=store).manifest
-        rows = store.rows(made["recording_id"], made["ingest_id"])
+            manifest = ingest(bag, PROFILE, store=store).manifest
+        rows = store.rows(manifest["recording_id"], manifest["ingest_id"])
         tables.append(rows.drop_columns(["ingest_id"]))
     assert len(tables[0]) > 30
     assert tables[0].equals(tables[1], check_metadata=True)
@@ -142,7 +142,7 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
     parts=st.lists(st.lists(st.lists(st.integers(0, 9), max_size=4), max_size=5), max_size=6),
     expected=st.integers(0, 40),
 )
-def test_a_column_that_grows_is_its_parts_one_after_the_other(parts, expected):
+def test_growing_column_concatenates_its_parts(parts, expected):
     def column(rows: list[list[int]]) -> Ragged:
         flat = np.array([value for row in rows for value in row], np.int32)
         return Ragged(flat, offsets_of(np.array([len(row) for row in rows], np.int64)))

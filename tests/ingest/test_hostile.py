@@ -1,4 +1,4 @@
-"""Hostile files: a clear refusal or a counted loss; no crash, no hang, no memory without bound."""
+"""Hostile files are rejected or counted as lost, without crash, hang or unbounded memory."""
 
 import io
 import json
@@ -31,8 +31,8 @@ from restock.replay.store.store import Store
 # -- sqlite: programs in place of tables ----------------------------------------------------------
 
 
-def bag_with(folder: Path, script: str) -> Path:
-    """Return a bag's file after an SQL script."""
+def write_bag_and_run(folder: Path, script: str) -> Path:
+    """Write a bag, run an SQL script on it, and return its file."""
     file = next(write_bag(folder / "run", 2).glob("*.db3"))
     base = sqlite3.connect(file)
     base.executescript(script)
@@ -54,13 +54,13 @@ SCRIPTS = {
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_sqlite_files_that_are_programs_are_refused(script, tmp_path):
+def test_sqlite_files_without_plain_tables_are_rejected(script, tmp_path):
     with pytest.raises(RecordingError, match=SCRIPTS[script]):
-        open_recording(bag_with(tmp_path, script))
+        open_recording(write_bag_and_run(tmp_path, script))
 
 
-def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path):
-    file = bag_with(
+def test_sqlite_values_of_wrong_type_are_counted(tmp_path):
+    file = write_bag_and_run(
         tmp_path,
         "UPDATE messages SET timestamp = 'noon' WHERE id = 1;"
         "UPDATE messages SET timestamp = 1.5 WHERE id = 2;"
@@ -75,8 +75,8 @@ def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path):
         assert recording.span_ns is not None
 
 
-def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path):
-    """Interior pages whose every child is the same page: a few kB that hold 10^14 rows."""
+def test_sqlite_tree_with_repeated_pages_is_rejected(tmp_path):
+    """Interior pages refer to the same child repeatedly: a few kB would give 10^14 rows."""
     file = tmp_path / "loop.db3"
     base = sqlite3.connect(file)
     base.executescript(
@@ -94,7 +94,7 @@ def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path):
     content = bytearray(file.read_bytes())
 
     def pointers(page: int) -> list[int]:
-        """Where an interior page keeps the numbers of its children."""
+        """Return the offsets of an interior page's child page numbers."""
         at = (page - 1) * 512
         assert content[at] == 5
         count = int.from_bytes(content[at + 3 : at + 5], "big")
@@ -106,7 +106,7 @@ def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path):
     first = int.from_bytes(content[pointers(root)[1] : pointers(root)[1] + 4], "big")
     page = bytes(content[(first - 1) * 512 : first * 512])
     pages = len(content) // 512
-    for level in range(7):  # a chain of pages: each child of one is the next
+    for level in range(7):  # a chain of pages: all children of a page are the next page
         content += page
         for at in pointers(pages + 1 + level):
             child = first if level == 6 else pages + 2 + level
@@ -117,20 +117,20 @@ def test_a_sqlite_tree_that_multiplies_its_pages_is_refused(tmp_path):
     file.write_bytes(content)
     with pytest.raises(RecordingError, match=r"out of order|2nd reference"):
         open_recording(file)
-    with open_recording(file, salvage=True) as recording:  # each page once
+    with open_recording(file, salvage=True) as recording:  # each page is read once
         assert recording.messages <= 5000
 
 
-# -- memory and time: in a process that may have little -------------------------------------------
+# -- memory and time, in a process with little memory ---------------------------------------------
 
-LITTLE_MB = 700  # imports alone take some 300 of address space
+MEMORY_LIMIT_MB = 700  # imports alone take some 300 MB of address space
 
 
-def limited(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Python where no more than LITTLE_MB can be allocated, for at most a minute."""
+def run_limited(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with at most MEMORY_LIMIT_MB of address space, for at most a minute."""
 
     def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (LITTLE_MB << 20, LITTLE_MB << 20))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_MB << 20, MEMORY_LIMIT_MB << 20))
 
     return subprocess.run(
         [sys.executable, *arguments],
@@ -171,22 +171,24 @@ def one_topic(
     return out.getvalue()
 
 
-def family(*types: str) -> bytes:
+def joined_definitions(*types: str) -> bytes:
     rule = "\n" + "=" * 80 + "\nMSG: "
     return rule.join(types).encode()
 
 
 @cache
-def bomb() -> bytes:
-    """Return a thousand million zeros."""
+def zstd_bomb() -> bytes:
+    """Return a thousand MiB of zeros, compressed."""
     pack = zstandard.ZstdCompressor().compressobj(size=1000 << 20)
     zeros = bytes(1 << 20)
     return b"".join(pack.compress(zeros) for _ in range(1000)) + pack.flush()
 
 
-DEEP = family("pkg/T1 a", *(f"pkg/T{n}\npkg/T{n + 1} a" for n in range(1, 500)), "pkg/T500\nbool a")
+DEEP = joined_definitions(
+    "pkg/T1 a", *(f"pkg/T{n}\npkg/T{n + 1} a" for n in range(1, 500)), "pkg/T500\nbool a"
+)
 WIDE = (
-    family(
+    joined_definitions(
         "pkg/T1 a\npkg/T1 b", *(f"pkg/T{n}\npkg/T{n + 1} a\npkg/T{n + 1} b" for n in range(1, 23))
     ).replace(b"T23", b"T1x")
     + b"\n"
@@ -196,62 +198,62 @@ WIDE = (
 
 
 def sequence_of_sequences(depth: int) -> bytes:
-    """Each level repeats the next: with counts of four thousand million at every one."""
+    """Return definitions whose every level repeats the next, so counts of 2^32 can multiply."""
     levels = (f"pkg/T{n}\npkg/T{n + 1}[] a" for n in range(1, depth))
-    return family("pkg/T1[] a", *levels, f"pkg/T{depth}\nuint8[] a")
+    return joined_definitions("pkg/T1[] a", *levels, f"pkg/T{depth}\nuint8[] a")
 
 
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
-    "a zstd file that is a bomb": (bomb, "refused"),
-    "a chunk that is a zstd bomb": (
-        lambda: mcap_of(chunk(b"zstd", bomb(), 1000 << 20)),
+    "zstd_file_bomb": (zstd_bomb, "refused"),
+    "zstd_chunk_bomb": (
+        lambda: mcap_of(chunk(b"zstd", zstd_bomb(), 1000 << 20)),
         "that claim to hold",
     ),
-    "a chunk that claims little and holds much": (
-        lambda: mcap_of(chunk(b"zstd", bomb(), 100)),
+    "chunk_larger_than_declared": (
+        lambda: mcap_of(chunk(b"zstd", zstd_bomb(), 100)),
         "more than it claims",
     ),
-    "a record of 2^63 bytes": (
+    "record_of_2^63_bytes": (
         lambda: mcap_of(struct.pack("<BQ", 6, 1 << 63)),
         "more than there are",
     ),
-    "zstd messages that are bombs": (
-        lambda: one_topic("pkg/msg/T", b"uint8[] a", bomb()[: 1 << 16]),
+    "zstd_message_bomb": (
+        lambda: one_topic("pkg/msg/T", b"uint8[] a", zstd_bomb()[: 1 << 16]),
         "",
     ),
-    "a definition 500 messages deep": (
+    "definition_500_deep": (
         lambda: one_topic("pkg/msg/T", DEEP, bytes(9)),
         "nests deeper than",
     ),
-    "a definition that doubles 23 times": (
+    "definition_doubled_23_times": (
         lambda: one_topic("pkg/msg/T", WIDE, bytes(9)),
         "more than 20,000 fields",
     ),
-    "an array of 2^31": (
+    "array_of_2^31": (
         lambda: one_topic("pkg/msg/T", b"float64[2147483648] a", bytes(9)),
         "an array of 2,147,483,648",
     ),
-    "counts of 2^32 within each other": (
+    "nested_counts_of_2^32": (
         lambda: one_topic("pkg/msg/T", sequence_of_sequences(20), b"\0\1\0\0" + b"\xff" * 4000),
         "",
     ),
-    "empty elements by the thousand million": (
+    "2^31_empty_elements": (
         lambda: one_topic(
             "pkg/msg/T",
-            family("pkg/E[] a", "pkg/E\n# nothing"),
+            joined_definitions("pkg/E[] a", "pkg/E\n# nothing"),
             b"\0\1\0\0\xff\xff\xff\x7f" + bytes(64),
         ),
         "",
     ),
-    "JSON 100,000 deep": (
+    "json_100000_deep": (
         lambda: one_topic("T", b"{}", b'{"a":' * 100_000, "jsonschema", "json"),
         "",
     ),
-    "a protobuf definition of noise": (
+    "random_protobuf_definition": (
         lambda: one_topic("p.T", b"\x0a\xff\xff\xff\x0f" * 99, b"", "protobuf", "protobuf"),
         "cannot be parsed",
     ),
-    "metadata without end": (
+    "endless_metadata": (
         lambda: b"\x89MCAP0\r\n" + record(0x0C, bytes(8)) * 100_000,
         "its footer is missing",
     ),
@@ -259,15 +261,15 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("name", one_in(6, HOSTILE))
-def test_little_memory_is_enough_for_hostile_files(name, tmp_path):
-    make, says = HOSTILE[name]
+def test_hostile_files_are_read_in_little_memory(name, tmp_path):
+    content_of, message = HOSTILE[name]
     path = tmp_path / "run.mcap"
-    path.write_bytes(make())
-    done = limited("-c", READ, str(path))
+    path.write_bytes(content_of())
+    done = run_limited("-c", READ, str(path))
     assert "Traceback" not in done.stderr, done.stderr
-    assert says in done.stdout + done.stderr
+    assert message in done.stdout + done.stderr
     *_, code, counted = done.stdout.split()
-    assert (code, counted) in {("0", "1"), ("2", "-"), ("3", "-")}  # counted, whatever it was
+    assert (code, counted) in {("0", "1"), ("2", "-"), ("3", "-")}  # counted in any case
 
 
 READ = """
@@ -296,7 +298,7 @@ IDL = "module pkg {{ module msg {{ {} struct T {{ {} double x; }}; }}; }};"
         "/*" * 99_999 + "(",
     ],
 )
-def test_idl_that_would_take_its_parser_hours_is_refused(text):
+def test_idl_with_exponential_parse_time_is_rejected(text):
     channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", text.encode())
     with pytest.raises(CannotDecode, match=r"nests brackets|cannot be parsed"):
         message_type(channel, "humble")
@@ -305,7 +307,7 @@ def test_idl_that_would_take_its_parser_hours_is_refused(text):
 # -- metadata.yaml ------------------------------------------------------------------------------
 
 
-LAUGHS = "\n".join(
+BILLION_LAUGHS = "\n".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" if n else "a0: &a0 [lol]" for n in range(30)
 )
 
@@ -313,7 +315,8 @@ LAUGHS = "\n".join(
 @pytest.mark.parametrize(
     "text",
     [
-        LAUGHS + "\nrosbag2_bagfile_information: {relative_file_paths: [*a29], version: *a29}",
+        BILLION_LAUGHS
+        + "\nrosbag2_bagfile_information: {relative_file_paths: [*a29], version: *a29}",
         "rosbag2_bagfile_information: {topics_with_message_count: [{topic_metadata:"
         " {name: [1], serialization_format: [cdr]}, message_count: {}}]}",
         "rosbag2_bagfile_information: {relative_file_paths: ['', '..', '/', 'a\\0b', null]}",
@@ -323,7 +326,7 @@ LAUGHS = "\n".join(
         "\xff",
     ],
 )
-def test_metadata_of_any_kind_leaves_the_files_as_they_are(text, tmp_path):
+def test_invalid_metadata_is_ignored(text, tmp_path):
     bag = write_bag(tmp_path / "run", 2)
     (bag / "metadata.yaml").write_text(text, encoding="latin-1")
     with open_recording(bag) as recording:
@@ -333,29 +336,31 @@ def test_metadata_of_any_kind_leaves_the_files_as_they_are(text, tmp_path):
 
 # -- the terminal ---------------------------------------------------------------------------
 
-EVIL = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
+CONTROL_CHARACTERS = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
 
 
-def test_no_control_character_reaches_the_terminal(tmp_path, capsys):
+def test_control_characters_are_escaped(tmp_path, capsys):
     path = tmp_path / "evil.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema(EVIL, "ros2msg", f"pkg/{EVIL} a".encode())
-        channel = writer.register_channel(EVIL, "cdr", schema)
-        other = writer.register_channel(EVIL + "2", EVIL, 0)
+        schema = writer.register_schema(
+            CONTROL_CHARACTERS, "ros2msg", f"pkg/{CONTROL_CHARACTERS} a".encode()
+        )
+        channel = writer.register_channel(CONTROL_CHARACTERS, "cdr", schema)
+        other = writer.register_channel(CONTROL_CHARACTERS + "2", CONTROL_CHARACTERS, 0)
         for number in (channel, other):
             writer.add_message(number, 1, b"", 1)
-        writer.add_attachment(1, 1, EVIL, EVIL, b"")
-        writer.add_metadata(EVIL, {})
+        writer.add_attachment(1, 1, CONTROL_CHARACTERS, CONTROL_CHARACTERS, b"")
+        writer.add_metadata(CONTROL_CHARACTERS, {})
         writer.finish()
     bag = write_bag(tmp_path / "run", 2)
     text = (bag / "metadata.yaml").read_text()
-    escaped = json.dumps(EVIL)
+    escaped = json.dumps(CONTROL_CHARACTERS)
     text = text.replace("name: /bumper", f"name: {escaped}").replace("run.db3", "gone\\e[2J.db3")
     (bag / "metadata.yaml").write_text(text)
     with sqlite3.connect(next(bag.glob("*.db3"))) as base:
-        base.execute("UPDATE topics SET type = ? WHERE name = '/odom'", (EVIL,))
+        base.execute("UPDATE topics SET type = ? WHERE name = '/odom'", (CONTROL_CHARACTERS,))
     base.close()
     odd = write_mcap(tmp_path / "a\x1b[2Jb.mcap", 2)
     assert main(["info", str(path), str(bag), str(odd), str(tmp_path / "no\x1b[2J")]) == 2
@@ -373,7 +378,7 @@ def test_no_control_character_reaches_the_terminal(tmp_path, capsys):
 @pytest.mark.parametrize(
     "name", one_in(3, [b"a\x1b[2J\nb\xe2\x80\xaec", b"bad\xff", b"[red]caf\xc3\xa9 [b]"])
 )
-def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, capsys, shell):
+def test_unusual_file_names_are_ingested_and_escaped(name, storage, tmp_path, capsys, shell):
     bag = write_drive(Drive(2.0, truth="nominal"), tmp_path / "run", storage=storage)
     (file,) = bag.glob("run.*")
     odd = tmp_path / os.fsdecode(name)
@@ -396,26 +401,26 @@ def test_any_name_of_a_file_is_ingested_and_escaped(name, storage, tmp_path, cap
 
 
 @pytest.mark.long
-def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path):
-    """Ninety messages of 8 MiB in a few kB, in a process that could not hold them all."""
+def test_zstd_messages_are_decompressed_in_batches(tmp_path):
+    """Read ninety messages of 8 MiB from a few kB, in a process that cannot hold them all."""
     packed = zstandard.ZstdCompressor().compress(
         b"\0\1\0\0" + (8 << 20).to_bytes(4, "little") + bytes(8 << 20)
     )
     channel = ("/t", "cdr", "pkg/msg/T", "ros2msg", b"uint8[] a", [packed] * 90)
     path = write_channels(tmp_path / "run.mcap", channel)
-    done = limited("-c", READ, str(path), "no field")
+    done = run_limited("-c", READ, str(path), "no field")
     assert done.stdout.split()[-2:] == ["0", "90"], done.stderr
 
 
 @pytest.mark.long
-def test_definitions_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
-    """Check thirty definitions of 40 kB that differ, against a tenth of the limit."""
+def test_total_size_of_definitions_is_limited(tmp_path, monkeypatch):
+    """Read thirty different definitions of 40 kB with a tenth of the limit."""
     monkeypatch.setattr(recording, "MAX_DEFINED_BYTES", recording.MAX_DEFINED_BYTES // 10)
     texts = [f"bool data\n# {n}\n".encode() + b"# nothing\n" * 4_000 for n in range(30)]
     channels = (
         (f"/t{number:02}{twin}", "cdr", "pkg/msg/T", "ros2msg", text, [b"\0\1\0\0\1"])
         for number, text in enumerate(texts)
-        for twin in "ab"  # the same again costs nothing
+        for twin in "ab"  # a repeated definition costs nothing
     )
     with open_recording(write_channels(tmp_path / "run.mcap", *channels)) as opened:
         skipped = [name for name, topic in opened.topics.items() if topic.skipped]

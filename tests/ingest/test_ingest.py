@@ -1,4 +1,4 @@
-"""`restock ingest`: recordings in, a store out, and what it says and returns on the way."""
+"""`restock ingest`: recordings in, a store out, its output and its exit codes."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run `restock ingest … --json`: exit code, the document, stderr."""
+    """Return a function that runs `restock ingest … --json`: exit code, document, stderr."""
 
     def ingest(*args: object) -> tuple[int, Any, str]:
         code = main(["ingest", *map(str, args), "--json"])
@@ -40,21 +40,21 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return ingest
 
 
-def test_a_bag_becomes_transitions(bag, tmp_path, run):
-    code, said, _ = run(bag, "--store", tmp_path / "s")
+def test_ingest_writes_transitions(bag, tmp_path, run):
+    code, document, _ = run(bag, "--store", tmp_path / "s")
     assert code == 0
-    (one,) = said["recordings"]
-    assert (one["status"], one["transitions"], one["episodes"], one["ticks"]) == (
+    (result,) = document["recordings"]
+    assert (result["status"], result["transitions"], result["episodes"], result["ticks"]) == (
         "written", 29, 2, 30,
     )  # fmt: skip
-    assert one["ticks"] == one["transitions"] + one["episode_ends"] + sum(
-        drop["count"] for drop in one["drops"]
+    assert result["ticks"] == result["transitions"] + result["episode_ends"] + sum(
+        drop["count"] for drop in result["drops"]
     )
-    assert one["conditions"]["nominal"] == 29
-    assert one["endings"] == {"goal": 1, "end of the recording": 1}
-    topics = {topic["topic"]: topic for topic in one["topics"]}
+    assert result["conditions"]["nominal"] == 29
+    assert result["endings"] == {"goal": 1, "end of the recording": 1}
+    topics = {topic["topic"]: topic for topic in result["topics"]}
     assert topics["/cmd_vel"]["expected"] == topics["/cmd_vel"]["decoded"] == 30
-    assert one["messages"]["expected"] == one["messages"]["decoded"]
+    assert result["messages"]["expected"] == result["messages"]["decoded"]
     with Store(tmp_path / "s") as store:
         rows = store.sql("SELECT count(*), count(*) FILTER (terminated) FROM transitions")
         assert rows.fetchall() == [(29, 1)]
@@ -64,22 +64,22 @@ def test_a_bag_becomes_transitions(bag, tmp_path, run):
         ]
 
 
-def test_unchanged_is_left_alone_and_changed_is_replaced(bag, tmp_path, run):
+def test_unchanged_recording_is_skipped_and_changed_replaced(bag, tmp_path, run):
     store = tmp_path / "s"
     run(bag, "--store", store)
-    code, said, _ = run(bag, "--store", store)
-    assert (code, said["recordings"][0]["status"]) == (0, "unchanged")
-    code, said, _ = run(bag, "--store", store, "--force")
-    assert (code, said["recordings"][0]["status"]) == (0, "written")
+    code, document, _ = run(bag, "--store", store)
+    assert (code, document["recordings"][0]["status"]) == (0, "unchanged")
+    code, document, _ = run(bag, "--store", store, "--force")
+    assert (code, document["recordings"][0]["status"]) == (0, "written")
     text = WAREHOUSE
     other = tmp_path / "other.toml"
     text = text.replace("time_limit_steps = 240", "time_limit_steps = 5")
     other.write_text(text.replace('name = "warehouse_amr"', 'name = "other"'))
-    code, said, _ = run(bag, "--store", store, "--profile", other)
-    assert (code, said["recordings"][0]["status"]) == (0, "written")
-    # As where a recording holds several robots, each with its profile.
+    code, document, _ = run(bag, "--store", store, "--profile", other)
+    assert (code, document["recordings"][0]["status"]) == (0, "written")
+    # The same happens if a recording holds several robots, each with a profile.
     replaced = "replaces its 29 transitions of the profile 'warehouse_amr': a store keeps one set"
-    assert [note for note in said["recordings"][0]["notes"] if note.startswith(replaced)]
+    assert [note for note in document["recordings"][0]["notes"] if note.startswith(replaced)]
     with Store(store) as opened:
         ((rows, hashes),) = opened.sql(
             "SELECT count(*), count(DISTINCT profile_hash) FROM transitions"
@@ -87,25 +87,25 @@ def test_unchanged_is_left_alone_and_changed_is_replaced(bag, tmp_path, run):
     assert (rows, hashes) == (29, 1)
 
 
-def test_a_dry_run_writes_nothing(bag, tmp_path, run, monkeypatch):
+def test_dry_run_writes_nothing(bag, tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, said, _ = run(bag, "--dry-run")
-    assert (code, said["recordings"][0]["status"]) == (0, "dry run")
-    assert said["recordings"][0]["transitions"] == 29
+    code, document, _ = run(bag, "--dry-run")
+    assert (code, document["recordings"][0]["status"]) == (0, "dry run")
+    assert document["recordings"][0]["transitions"] == 29
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_workers_make_the_same_store_as_one(tmp_path, run):
+def test_two_workers_write_the_same_store_as_one(tmp_path, run):
     bags = [write_bag(Drive(duration_s=2.0 + n), tmp_path / f"bag{n}") for n in range(3)]
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"")
     found = []
     for workers in (1, 2):
         store = tmp_path / f"store{workers}"
-        code, said, err = run(bags[0], bad, *bags[1:], "--store", store, "--workers", workers)
+        code, document, err = run(bags[0], bad, *bags[1:], "--store", store, "--workers", workers)
         assert code == 3
         assert "bad.mcap" in err
-        assert [one["path"] for one in said["recordings"]] == [*map(str, bags), str(bad)]
+        assert [row["path"] for row in document["recordings"]] == [*map(str, bags), str(bad)]
         with Store(store) as opened:
             found.append(
                 opened.sql(
@@ -116,7 +116,7 @@ def test_two_workers_make_the_same_store_as_one(tmp_path, run):
     assert found[0].equals(found[1])
 
 
-def test_what_is_no_recording_leaves_the_store_as_it_was(bag, tmp_path, run):
+def test_invalid_recording_leaves_store_unchanged(bag, tmp_path, run):
     store, bad = tmp_path / "s", tmp_path / "bad.mcap"
     run(bag, "--store", store)
     bad.write_bytes(b"hello, I am no recording at all")
@@ -129,7 +129,7 @@ def test_what_is_no_recording_leaves_the_store_as_it_was(bag, tmp_path, run):
     assert {path: path.stat().st_mtime_ns for path in store.rglob("*")} == before
 
 
-def test_the_wrong_profile_says_what_is_missing(bag, tmp_path, run):
+def test_wrong_profile_reports_missing_topics(bag, tmp_path, run):
     text = WAREHOUSE
     other = tmp_path / "other.toml"
     other.write_text(text.replace('"/scan"', '"/front/scan"').replace('"/imu"', '"/odom"'))
@@ -141,17 +141,17 @@ def test_the_wrong_profile_says_what_is_missing(bag, tmp_path, run):
     assert not (tmp_path / "s").exists()
 
 
-def test_an_optional_topic_of_another_name_is_asked_after(bag, tmp_path, run):
-    """As of the one robot whose driver was updated: else its rows say it had no such sensor."""
+def test_renamed_optional_topic_gets_suggestion(bag, tmp_path, run):
+    """A renamed driver topic would otherwise leave rows that claim to lack the sensor."""
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE.replace('topic = "/imu"', 'optional = true\ntopic = "/front/imu"'))
-    _, said, _ = run(bag, "--dry-run", "--profile", other)
-    notes = said["recordings"][0]["notes"]
+    _, document, _ = run(bag, "--dry-run", "--profile", other)
+    notes = document["recordings"][0]["notes"]
     assert "imu: no topic /front/imu in this recording: did you mean /imu?" in notes
 
 
-def test_no_usable_step_is_an_error_with_the_reasons(tmp_path, run):
-    drive = write_bag(Drive(goals=[(0.0, 1.2, 1.0)]), tmp_path / "bag")  # there already
+def test_no_usable_step_is_an_error_with_reasons(tmp_path, run):
+    drive = write_bag(Drive(goals=[(0.0, 1.2, 1.0)]), tmp_path / "bag")  # starts at its goal
     code, _, err = run(drive, "--store", tmp_path / "s")
     assert code == 2
     assert "goal already reached: 30 of 30 ticks" in err
@@ -159,7 +159,7 @@ def test_no_usable_step_is_an_error_with_the_reasons(tmp_path, run):
 
 
 @pytest.mark.parametrize(
-    ("args", "said"),
+    ("args", "message"),
     [
         ([], "no path given"),
         (["x.mcap"], "no store given"),
@@ -167,41 +167,41 @@ def test_no_usable_step_is_an_error_with_the_reasons(tmp_path, run):
         (["x.mcap", "--store", "s", "--profile", "warehouse"], "did you mean 'warehouse_amr'"),
     ],
 )
-def test_wrong_usage(args, said, run, tmp_path, monkeypatch):
+def test_wrong_usage_is_reported(args, message, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, err = run(*args)
     assert code == 2
-    assert said in err
+    assert message in err
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason=f"{TURTLEBOT.name} is not here")
-def test_turtlebot3_sim_humble(tmp_path, run):
-    """A recording this project did not write: 29 s of driving at 5 Hz, no goal, sim time."""
-    code, said, _ = run(TURTLEBOT, "--store", tmp_path / "s", "--profile", "turtlebot3")
+def test_ingest_of_turtlebot3_sim_humble(tmp_path, run):
+    """A recording from elsewhere: 29 s of driving at 5 Hz, no goal, simulated time."""
+    code, document, _ = run(TURTLEBOT, "--store", tmp_path / "s", "--profile", "turtlebot3")
     assert code == 0
-    (one,) = said["recordings"]
-    assert one["ticks"] == 140  # commands
-    assert one["transitions"] == 138
-    assert one["drops"] == [{"reason": "scan: not yet received", "count": 1}]
-    assert one["clock_offset_ns"] * 1e-9 == pytest.approx(1_701_217_691.8, abs=0.05)
-    topics = {topic["topic"]: topic for topic in one["topics"]}
+    (result,) = document["recordings"]
+    assert result["ticks"] == 140  # one per command
+    assert result["transitions"] == 138
+    assert result["drops"] == [{"reason": "scan: not yet received", "count": 1}]
+    assert result["clock_offset_ns"] * 1e-9 == pytest.approx(1_701_217_691.8, abs=0.05)
+    topics = {topic["topic"]: topic for topic in result["topics"]}
     assert topics["/imu"]["decoded"] == 5636
     assert "unknown type" in topics["/performance_metrics"]["reason"]
-    assert {item["input"] for item in one["stand_ins"]} >= {"goal", "plan", "bumper"}
+    assert {item["input"] for item in result["stand_ins"]} >= {"goal", "plan", "bumper"}
     with Store(tmp_path / "s") as store:
         ((span_s, moved_m),) = store.sql(
             "SELECT (max(stamp_ns) - min(stamp_ns)) / 1e9, sum(progress_m) FROM transitions"
         ).fetchall()
     assert span_s == pytest.approx(27.5, abs=0.5)
-    assert 1 < moved_m < 6  # .2 m/s with turns
+    assert 1 < moved_m < 6  # 0.2 m/s with turns
 
 
-def test_labels_of_the_sample_log_are_as_good_as_documented(run):
-    code, said, _ = run(ROOT / "sample_logs" / "amr_monday.mcap", "--dry-run")
+def test_label_scores_of_sample_log_match_docs(run):
+    code, document, _ = run(ROOT / "sample_logs" / "amr_monday.mcap", "--dry-run")
     assert code == 0
     page = (ROOT / "docs" / "ingest.md").read_text()
-    scores = {score["condition"]: score for score in said["recordings"][0]["label_scores"]}
-    for exposure in said["recordings"][0]["exposures"]:  # docs/profile.md tells of those
+    scores = {score["condition"]: score for score in document["recordings"][0]["label_scores"]}
+    for exposure in document["recordings"][0]["exposures"]:  # docs/profile.md covers exposures
         assert scores.pop(exposure)["support"] > 0
     for name, score in scores.items():
         found = re.search(rf"^\| `{name}` \| default \| ([.\d]+) / ([.\d]+) \|", page, re.M)

@@ -1,4 +1,4 @@
-"""`restock store label`: changed conditions over stored signals, in one commit."""
+"""`restock store label`: changed conditions applied to stored signals in one commit."""
 
 import shutil
 from pathlib import Path
@@ -15,14 +15,14 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition
 from restock.replay.store.store import Store
 
-# Looks ahead: at the last transition of an episode, at a step that is no row of the store.
+# Looks ahead: the last transition of an episode uses a step that is not a stored row.
 SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}"\n'
 HALF_WAY = "lead(pose_x_m) OVER episode > 2.55"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two recordings, one of which reaches its goal, read by a profile with a condition `soon`."""
+def ingested_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return two ingested recordings, one reaching its goal, with a profile that defines `soon`."""
     folder = tmp_path_factory.mktemp("label")
     profile = folder / "amr.toml"
     profile.write_text(TEXT + SOON.format(HALF_WAY))
@@ -34,8 +34,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def store(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+def store(ingested_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(ingested_folder, tmp_path, dirs_exist_ok=True)
     return tmp_path / "store"
 
 
@@ -45,19 +45,19 @@ def rows(path: Path, columns: str = "*") -> list[tuple]:
         return opened.sql(query).fetchall()
 
 
-def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, shell):
+def test_changed_conditions_change_only_labels(store, tmp_path, shell):
     others = "* EXCLUDE (primary_condition, conditions, labels_version, ingest_id)"
     before = rows(store, others)
     changed = tmp_path / "changed.toml"
     changed.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
     files = len(DeltaTable(str(store / "transitions")).file_uris())
     version = DeltaTable(str(store / "transitions")).version()
-    said = shell.json("store", "label", store, "--profile", changed)
-    assert said["version"] == version + 1  # one commit for both recordings
-    assert [row["changed"] for row in said["recordings"]] == [6, 6]
+    document = shell.json("store", "label", store, "--profile", changed)
+    assert document["version"] == version + 1  # one commit for both recordings
+    assert [row["changed"] for row in document["recordings"]] == [6, 6]
     assert len(DeltaTable(str(store / "transitions")).file_uris()) == files
     assert rows(store, others) == before
-    for row in said["recordings"]:
+    for row in document["recordings"]:
         assert row["named"]["soon"] == row["named_before"]["soon"] + 6
         (soon,) = [score for score in row["label_scores"] if score["condition"] == "soon"]
         assert soon["labelled"] == row["named"]["soon"]
@@ -69,7 +69,7 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, shel
     assert [row["changed"] for row in again["recordings"]] == [0, 0]
 
 
-def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
+def test_concurrently_ingested_recording_is_not_relabelled(store, tmp_path):
     writer = StoreWriter(store)
 
     def conditions_of(name: str) -> list[Condition]:
@@ -77,20 +77,20 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
 
     original = writer.rows
 
-    def rows_and_a_rival(recording_id: str, ingest_id: str):
+    def rows_after_concurrent_ingest(recording_id: str, ingest_id: str):
         found = original(recording_id, ingest_id)
         bag, profile = str(tmp_path / "a"), str(tmp_path / "amr.toml")
         command = ["ingest", bag, "--store", str(store), "--profile", profile, "--force"]
         assert main(command) == 0
         return found
 
-    writer.rows = rows_and_a_rival  # type: ignore[method-assign]
+    writer.rows = rows_after_concurrent_ingest  # type: ignore[method-assign]
     with pytest.raises(StoreError, match="ingested again or removed in the meantime"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
 
 
-def test_what_cannot_be_labelled_again_is_refused(store, tmp_path, shell):
+def test_relabelling_needs_a_store_and_episode_ends(store, tmp_path, shell):
     assert "there is no store, or it is empty" in shell.err("store", "label", tmp_path / "none")
     writer = StoreWriter(store)
     original = writer.rows

@@ -1,4 +1,4 @@
-"""The true conditions of a step, and labels scored against them."""
+"""True conditions of steps, and labels scored against them."""
 
 from dataclasses import fields
 
@@ -12,7 +12,7 @@ from restock.ingest.store.manifest import LabelScore, label_scores, pooled, scor
 from restock.ingest.task.schema import primary_of, true_names, truth_text
 
 
-def test_the_true_conditions_of_a_step_are_one_text():
+def test_true_conditions_round_trip_as_text():
     assert truth_text(["recovery", "near_collision", "recovery"]) == "near_collision,recovery"
     assert truth_text([]) == "nominal"
     assert true_names("near_collision, recovery") == {"near_collision", "recovery"}
@@ -20,7 +20,7 @@ def test_the_true_conditions_of_a_step_are_one_text():
 
 
 @pytest.mark.parametrize(
-    ("text", "one"),
+    ("text", "expected"),
     [
         ("nominal", "nominal"),
         ("wheel_slip", "wheel_slip"),
@@ -30,11 +30,11 @@ def test_the_true_conditions_of_a_step_are_one_text():
         ("ramp,carpet", "carpet"),
     ],
 )
-def test_the_most_pressing_condition_comes_first(text, one):
-    assert primary_of(text) == one
+def test_primary_of_true_conditions(text, expected):
+    assert primary_of(text) == expected
 
 
-def test_a_row_of_several_conditions_is_scored_for_each():
+def test_row_with_several_conditions_scores_each():
     rows = pa.table(
         {
             "episode_index": [0, 0, 0, 0],
@@ -50,12 +50,13 @@ def test_a_row_of_several_conditions_is_scored_for_each():
     assert (near.precision, near.recall, near.labelled, near.support) == (0.5, 0.5, 2, 2)
     assert (after.precision, after.recall, after.labelled, after.support) == (1, 1, 1, 1)
     assert (busy.condition, busy.known, busy.labelled, busy.support) == ("busy", 3, 2, 2)
-    assert (busy.agreed, busy.event_support, busy.event_found) == (1, 1, 1)  # by its own truth
+    # scored against the true exposures
+    assert (busy.agreed, busy.event_support, busy.event_found) == (1, 1, 1)
 
 
 @st.composite
 def episodes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Labels and truth (N,) with their episode and step."""
+    """Draw labels and truth (N,) with their episode and step."""
     lengths = draw(st.lists(st.integers(1, 9), min_size=1, max_size=5))
     count = sum(lengths)
     holds, true = (np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
@@ -69,12 +70,12 @@ def episodes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 def texts(true: np.ndarray) -> list[str]:
-    return ["slip" if one else "nominal" for one in true]
+    return ["slip" if is_slip else "nominal" for is_slip in true]
 
 
 @settings(max_examples=60)
 @given(episodes(), st.integers(0, 3))
-def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
+def test_event_scores_match_pairwise_search(drawn, reach):
     holds, true, episode, step = drawn
     found = score({"slip": holds}, texts(true), episode, step, 0.4 / reach if reach else 1.0)
     if not found:
@@ -98,27 +99,31 @@ def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
             for other in range(len(values))
         )
 
-    (one,) = found
-    given_, truly = runs(holds), runs(true)
-    assert (one.event_labelled, one.event_support) == (len(given_), len(truly))
-    assert one.event_right == sum(near(run, true) for run in given_)
-    assert one.event_found == sum(near(run, holds) for run in truly)
+    (score_,) = found
+    labelled_runs, true_runs = runs(holds), runs(true)
+    assert (score_.event_labelled, score_.event_support) == (len(labelled_runs), len(true_runs))
+    assert score_.event_right == sum(near(run, true) for run in labelled_runs)
+    assert score_.event_found == sum(near(run, holds) for run in true_runs)
 
 
 @settings(max_examples=40)
 @given(episodes(), st.randoms())
-def test_perfect_labels_score_one_and_parts_add_up(drawn, chance):
+def test_perfect_labels_score_1_and_parts_add_up(drawn, chance):
     holds, true, episode, step = drawn
-    for one in score({"slip": true}, texts(true), episode, step, 0.2):
-        assert one.precision == one.recall == one.event_precision == one.event_recall == 1
+    for score_ in score({"slip": true}, texts(true), episode, step, 0.2):
+        assert (
+            score_.precision == score_.recall == score_.event_precision == score_.event_recall == 1
+        )
     whole = score({"slip": holds}, texts(true), episode, step, 0.2)
     cut = chance.randrange(int(episode[-1]) + 1)
     parts = [
-        one
+        score_
         for part in (episode < cut, episode >= cut)
-        for one in score({"slip": holds[part]}, texts(true[part]), episode[part], step[part], 0.2)
+        for score_ in score(
+            {"slip": holds[part]}, texts(true[part]), episode[part], step[part], 0.2
+        )
     ]
     names = [field.name for field in fields(LabelScore) if field.name not in ("condition", "known")]
-    assert [[getattr(one, name) for name in names] for one in pooled(parts)] == [
-        [getattr(one, name) for name in names] for one in whole
+    assert [[getattr(score_, name) for name in names] for score_ in pooled(parts)] == [
+        [getattr(score_, name) for name in names] for score_ in whole
     ]

@@ -1,4 +1,4 @@
-"""LeRobot v3.0 data sets as recordings: values, time, what is missing, and what is refused."""
+"""LeRobot v3.0 data sets as recordings: values, time, missing data, and rejected layouts."""
 
 import json
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.input_columns import reckon
 from restock.replay.store.store import Store
 
-NAMES = ["arm_gripper.pos", "x.vel", "y.vel", "theta.vel"]  # of a LeKiwi, with one joint
+NAMES = ["arm_gripper.pos", "x.vel", "y.vel", "theta.vel"]  # those of a LeKiwi, with one joint
 FPS, FRAMES, EPISODES = 10, 40, 4
 VECTOR = {"dtype": "float32", "shape": [4], "names": NAMES}
 FILES = [f"data/chunk-000/file-00{number}.parquet" for number in range(2)]  # two episodes each
@@ -59,7 +59,7 @@ def lists(values: np.ndarray) -> pa.Array:
 
 
 def frames(episodes: range) -> dict[str, Any]:
-    """Return the columns of these episodes: straight ahead at .2 m/s, turning at 9 deg/s."""
+    """Return the columns of these episodes: straight ahead at 0.2 m/s, turning at 9 deg/s."""
     count = FRAMES * len(episodes)
     at = np.tile(np.arange(FRAMES), len(episodes))
     episode = np.repeat(np.array(episodes), FRAMES)
@@ -83,7 +83,7 @@ def rewrite(file: Path, **changes: Any) -> None:
 
 
 def write_set(folder: Path, more: dict[str, Any] | None = None, **info: Any) -> Path:
-    """Write a data set in LeRobot's layout: two data files of two episodes each.
+    """Write a data set in LeRobot's layout with two data files of two episodes each.
 
     `more` are further features by name.
     """
@@ -102,7 +102,7 @@ def write_set(folder: Path, more: dict[str, Any] | None = None, **info: Any) -> 
     return folder
 
 
-def test_values_are_those_of_the_table(tmp_path):
+def test_decoded_values_match_parquet(tmp_path):
     folder = write_set(tmp_path / "set")
     table = pa.concat_tables([pq.ParquetFile(folder / name).read() for name in FILES])
     with open_recording(folder) as recording:
@@ -124,25 +124,26 @@ def test_values_are_those_of_the_table(tmp_path):
     assert np.allclose(within, 1 / FPS, atol=1e-6)
 
 
-def test_a_folder_is_recognised_by_its_info_alone(tmp_path):
+def test_folder_is_recognised_by_its_info_file(tmp_path):
     folder = write_set(tmp_path / "sets" / "one")
     assert recordings_in(tmp_path) == [folder]
     with pytest.raises(RecordingError, match="not a recording"):
         open_recording(folder / FILES[0])
     identity = open_recording(folder).recording_id
     rewrite(folder / FILES[1], task_index=pa.array([7] * 80))
-    assert open_recording(folder).recording_id != identity  # by the data, not the info alone
+    # depends on the data, not only on the info file
+    assert open_recording(folder).recording_id != identity
     (folder / "meta/info.json").write_text('{"name": "of another tool"}')
     with pytest.raises(RecordingError, match="no recording in this folder"):
         recordings_in(tmp_path)
 
 
-def test_ingest_and_sql_take_a_data_set(tmp_path, shell):
+def test_ingest_and_sql_accept_data_set(tmp_path, shell):
     folder = write_set(tmp_path / "set")
     profile, store = tmp_path / "own.toml", tmp_path / "store"
     profile.write_text(PROFILE)
     action = np.zeros((80, 4), np.float32)
-    action[5, 1], action[6, 2] = np.nan, 0.1  # a command that is unknown, and one sideways
+    action[5, 1], action[6, 2] = np.nan, 0.1  # one unknown command, and one sideways command
     rewrite(folder / FILES[0], action=lists(action))
     assert shell.json("sql", folder, 'SELECT max(theta_vel) AS m FROM "/action"') == [{"m": 9.0}]
     (document,) = shell.json("ingest", folder, "--profile", profile, "--store", store)["recordings"]
@@ -159,21 +160,24 @@ def test_ingest_and_sql_take_a_data_set(tmp_path, shell):
     assert logged[0] == pytest.approx((np.radians(9),))
 
 
-def test_proposal_lists_the_topics(tmp_path):
+def test_proposal_lists_topics_of_data_set(tmp_path):
     folder, out = write_set(tmp_path / "set"), tmp_path / "own.toml"
-    assert main(["profile", "new", str(folder), "--out", str(out)]) == 3  # nothing usable by itself
+    assert main(["profile", "new", str(folder), "--out", str(out)]) == 3  # not usable without edits
     assert "/observation.state" in out.read_text()
 
 
-def test_images_are_frames_and_videos_are_listed(tmp_path):
+def test_images_are_read_and_videos_listed(tmp_path):
     pictures = [file_of(picture(number), "JPEG" if number % 2 else "PNG") for number in range(160)]
     image = {"dtype": "image", "shape": [32, 48, 3], "names": ["height", "width", "channels"]}
     video = {"dtype": "video", "shape": [32, 48, 3], "names": ["height", "width", "channels"]}
     folder = write_set(tmp_path / "set", {"images.front": image, "images.rear": video})
     for number, name in enumerate(FILES):
-        some = [{"bytes": one, "path": None} for one in pictures[number * 80 : number * 80 + 80]]
-        some[9]["bytes"] = None
-        rewrite(folder / name, **{"images.front": pa.array(some)})
+        images = [
+            {"bytes": picture_, "path": None}
+            for picture_ in pictures[number * 80 : number * 80 + 80]
+        ]
+        images[9]["bytes"] = None
+        rewrite(folder / name, **{"images.front": pa.array(images)})
     (folder / "videos/images.rear/chunk-000").mkdir(parents=True)
     (folder / "videos/images.rear/chunk-000/file-000.mp4").write_bytes(bytes(123))
     with open_recording(folder) as recording:
@@ -184,51 +188,51 @@ def test_images_are_frames_and_videos_are_listed(tmp_path):
             ("images.rear", "video/mp4", 123)
         ]
     assert front.fields["format"].tolist()[:2] == ["png", "jpeg"]
-    assert front.fields["data"][12].tobytes() == pictures[13]  # after one that is not there
+    assert front.fields["data"][12].tobytes() == pictures[13]  # after a missing frame
     assert front.fields["header.stamp"].tolist() == front.log_time_ns.tolist()
     assert (account.expected, account.decoded, account.lost) == (160, 158, 2)
 
 
-def cut(folder: Path) -> None:
+def truncate_file(folder: Path) -> None:
     (folder / FILES[1]).write_bytes((folder / FILES[1]).read_bytes()[:-9])
 
 
-def backwards(folder: Path) -> None:
+def swap_episodes(folder: Path) -> None:
     rewrite(folder / FILES[1], episode_index=pa.array([3] * 40 + [2] * 40))
 
 
-def still(folder: Path) -> None:
+def freeze_time(folder: Path) -> None:
     rewrite(folder / FILES[0], timestamp=pa.array(np.zeros(80, np.float32)))
 
 
-def no_number(folder: Path) -> None:
+def write_nan_time(folder: Path) -> None:
     rewrite(folder / FILES[0], timestamp=pa.array(np.full(80, np.nan, np.float32)))
 
 
-def other_columns(folder: Path) -> None:
+def drop_action(folder: Path) -> None:
     table = pq.ParquetFile(folder / FILES[0]).read()
     pq.write_table(table.drop_columns("action"), folder / FILES[0])
 
 
 @pytest.mark.parametrize(
-    ("harm", "words", "decoded"),
+    ("damage", "message", "decoded"),
     [
-        (cut, f"{FILES[1]} cannot be read: ", 80),
-        (backwards, f"{FILES[1]}: row 40 is of episode 2, after episode 3", 160),
-        (still, f"{FILES[0]}: row 1 of episode 0 is not later than the one before it", 160),
-        (no_number, f"{FILES[0]} cannot be read: a timestamp is not a number", 80),
-        (other_columns, f"{FILES[0]} cannot be read: it has no column action", 80),
+        (truncate_file, f"{FILES[1]} cannot be read: ", 80),
+        (swap_episodes, f"{FILES[1]}: row 40 is of episode 2, after episode 3", 160),
+        (freeze_time, f"{FILES[0]}: row 1 of episode 0 is not later than the one before it", 160),
+        (write_nan_time, f"{FILES[0]} cannot be read: a timestamp is not a number", 80),
+        (drop_action, f"{FILES[0]} cannot be read: it has no column action", 80),
     ],
 )
-def test_a_damaged_file_is_refused_or_salvaged(
-    tmp_path: Path, harm: Callable[[Path], None], words: str, decoded: int
+def test_damaged_file_is_rejected_or_salvaged(
+    tmp_path: Path, damage: Callable[[Path], None], message: str, decoded: int
 ) -> None:
     folder = write_set(tmp_path / "set")
-    harm(folder)
-    with pytest.raises(RecordingError, match=words) as refused:
+    damage(folder)
+    with pytest.raises(RecordingError, match=message) as error:
         open_recording(folder)
-    assert "--salvage" in str(refused.value.remedy)
-    assert words in incomplete(folder)
+    assert "--salvage" in str(error.value.remedy)
+    assert message in incomplete(folder)
     with open_recording(folder, salvage=True) as recording:
         recording.read({"/action": ["x_vel"]} if "/action" in recording.topics else {})
         account = recording.accounts["/action"]
@@ -237,7 +241,7 @@ def test_a_damaged_file_is_refused_or_salvaged(
         assert recording.integrity == "damaged"
 
 
-def test_missing_frames_are_counted(tmp_path):
+def test_missing_data_file_is_counted(tmp_path):
     folder = write_set(tmp_path / "set")
     (folder / FILES[0]).unlink()
     with open_recording(folder) as recording:
@@ -247,19 +251,19 @@ def test_missing_frames_are_counted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("info", "words"),
+    ("info", "message"),
     [
         ({"codebase_version": "v2.1"}, "codebase_version 'v2.1': only v3.0 is read"),
         ({"codebase_version": 3}, "codebase_version 3: only v3.0 is read"),
         ({"features": None}, "it has no features"),
     ],
 )
-def test_another_layout_is_refused(tmp_path: Path, info: dict[str, Any], words: str) -> None:
-    with pytest.raises(RecordingError, match=words):
+def test_unsupported_layout_is_rejected(tmp_path: Path, info: dict[str, Any], message: str) -> None:
+    with pytest.raises(RecordingError, match=message):
         open_recording(write_set(tmp_path / "set", **info))
 
 
-def test_features_that_are_not_read_are_noted(tmp_path):
+def test_unsupported_features_are_noted(tmp_path):
     text, wide = {"dtype": "string", "shape": [1]}, {"dtype": "float32", "shape": [4, 4]}
     odd = {
         f"odd{at}": {"dtype": "float32", "shape": s} for at, s in enumerate(([0], ["4"], [10**12]))
@@ -272,8 +276,8 @@ def test_features_that_are_not_read_are_noted(tmp_path):
         assert sum("only one dimension is read" in note for note in recording.notes) == 4
 
 
-def test_rows_of_another_length_are_lost(tmp_path, monkeypatch):
-    monkeypatch.setattr(lerobot_folder, "ROWS", 16)  # several batches a file lose some
+def test_rows_of_wrong_length_are_lost(tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot_folder, "ROWS", 16)  # so that several batches of a file lose some
     folder = write_set(tmp_path / "set")
     values = [[float(row)] * (4 if row % 10 else 3) for row in range(80)]
     rewrite(folder / FILES[0], action=pa.array(values, pa.list_(pa.float32())))
@@ -284,7 +288,7 @@ def test_rows_of_another_length_are_lost(tmp_path, monkeypatch):
     assert action.fields["x_vel"][:10].tolist() == [1.0, 2, 3, 4, 5, 6, 7, 8, 9, 11]
 
 
-def test_names_become_fields():
+def test_feature_names_become_field_names():
     assert field_names(["x.vel", "X vel", "3rd", ""], 4) == (
         "x_vel",
         "x_vel_1",
@@ -295,7 +299,7 @@ def test_names_become_fields():
     assert field_names(None, 2) == field_names(["one"], 2) == ("value_0", "value_1")
 
 
-def test_dead_reckoning_follows_the_arc():
+def test_dead_reckoning_follows_arc():
     time_ns = np.arange(101) * 10**7 * 2  # 2 s
     rates = np.stack([np.full(101, 0.5), np.zeros(101), np.full(101, 0.8)])
     poses = reckon(time_ns, rates, 0.5)
@@ -308,18 +312,18 @@ def test_dead_reckoning_follows_the_arc():
     sideways = reckon(time_ns, np.full((101, 3), [0.0, 0.3, 0.0]).T, 0.5)
     assert sideways.y_m[-1] == pytest.approx(0.6)
     apart = reckon(np.array([0, 10**9]), np.ones((3, 2)), 0.5)
-    assert apart.x_m.tolist() == [0.0, 0.0]  # nobody knows what happened in between
+    assert apart.x_m.tolist() == [0.0, 0.0]  # the gap is unknown
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ("theta_vel in deg/s", "theta_vel in furlongs", "has an unknown unit"),
         ('speed_mps = "x_vel", yaw', 'x_m = "x_vel", speed_mps = "x_vel", yaw', "unknown 'x_m'"),
         ('speed_mps = "x_vel", yaw', 'sideways_mps = "x_vel", yaw', "missing 'speed_mps'"),
     ],
 )
-def test_what_a_profile_cannot_say(old: str, new: str, words: str) -> None:
+def test_invalid_profile_of_data_set_is_rejected(old: str, new: str, message: str) -> None:
     head, mark, pose = PROFILE.partition("[inputs.pose]")
-    with pytest.raises(Exception, match=words):
+    with pytest.raises(Exception, match=message):
         parse_profile(head + mark + pose.replace(old, new), where="test")

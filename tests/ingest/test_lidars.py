@@ -1,4 +1,4 @@
-"""A robot with several lidars, or one beside its middle: clearance as one in the middle sees it."""
+"""Robots with several lidars or one off centre: clearance equals that of one in the middle."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -27,19 +27,19 @@ from restock.replay.trace.moment import seen_of
 TASK = load_profile("warehouse_amr").task
 LEFT_M, RIGHT_M = 2.0, 0.2  # y of the walls: the robot drives along y = 1
 BEAMS = 720
-Place = tuple[float, float, float]  # ahead, left, angle of its zero
+Place = tuple[float, float, float]  # x ahead, y left, yaw of its zero angle
 FRONT: Place = (0.28, 0.22, np.pi / 4)
 REAR: Place = (-0.28, -0.22, -3 * np.pi / 4)
 THREE_QUARTERS = 1.5 * np.pi
 
 
 @dataclass
-class Corridor(Drive):
-    """Along two walls, past a post and away from another; its lidars are `mounted` by topic."""
+class CorridorDrive(Drive):
+    """Drive between two walls, past a post, with lidars `mounted` by topic."""
 
     mounted: tuple[tuple[str, Place], ...] = (("/scan_front", FRONT), ("/scan_rear", REAR))
-    field_rad: float = THREE_QUARTERS  # of each
-    roll_rad: float = 0.0  # of the last one
+    field_rad: float = THREE_QUARTERS  # field of view of each lidar
+    roll_rad: float = 0.0  # roll of the last lidar
 
     def topics(self) -> dict[str, TopicColumns]:
         found = super().topics()
@@ -57,7 +57,7 @@ class Corridor(Drive):
         self, times_s: Any, place: Place, frame: str, *, upside_down: bool = False
     ) -> TopicColumns:
         step = self.field_rad / BEAMS
-        bearing = np.arange(BEAMS) * step - self.field_rad / 2  # of the lidar
+        bearing = np.arange(BEAMS) * step - self.field_rad / 2  # in the lidar's frame
         ranges = np.stack([cast(self.x_at(time) - 1.0, place, bearing) for time in times_s])
         fields = scans(ranges)
         sign = -1 if upside_down else 1
@@ -74,7 +74,7 @@ class Corridor(Drive):
 
 
 def cast(moved_m: float, place: Place, bearing: Any) -> Any:
-    """Ranges (B,) to the walls and to posts beside its way and behind where it began."""
+    """Return ranges (B,) to the walls, a post beside the path and a post behind its start."""
     x, y = 1.0 + moved_m + place[0], 1.0 + place[1]
     way = np.stack([np.cos(bearing + place[2]), np.sin(bearing + place[2])])
     with np.errstate(divide="ignore"):
@@ -89,20 +89,22 @@ def cast(moved_m: float, place: Place, bearing: Any) -> Any:
 
 
 def two_lidars(front: str = "", rear: str = "") -> str:
-    """Return the shipped profile of a robot with the lidars of `Corridor`."""
+    """Return the shipped profile with the two lidars of `CorridorDrive`."""
     start, end = WAREHOUSE.index("[inputs.scan]"), WAREHOUSE.index("[inputs.goal]")
     table = WAREHOUSE[start:end].replace("optional = true\n", "")
 
-    def of(name: str, topic: str, place: Place, more: str) -> str:
+    def scan_table(name: str, topic: str, place: Place, more: str) -> str:
         at = f"lidar_at_m = [{place[0]}, {place[1]}]\nlidar_yaw_rad = {place[2]}\n{more}\n"
         return table.replace("[inputs.scan]", f"[inputs.{name}]\n{at}").replace('"/scan"', topic)
 
-    both = of("scan", '"/scan_front"', FRONT, front) + of("scan_2", '"/scan_rear"', REAR, rear)
+    both = scan_table("scan", '"/scan_front"', FRONT, front) + scan_table(
+        "scan_2", '"/scan_rear"', REAR, rear
+    )
     return WAREHOUSE[:start] + both + WAREHOUSE[end:]
 
 
 def sectors_of(steps: Steps) -> Any:
-    """Clearance (T, K) at the usable ticks."""
+    """Return clearance (T, K) at the usable ticks."""
     return steps.signals["sector_clearance_m"][[problem == "" for problem in steps.problem]]
 
 
@@ -112,7 +114,7 @@ def sectors_of(steps: Steps) -> Any:
     st.floats(-0.2, 0.2),
     st.integers(0, 99),
 )
-def test_a_beam_counts_where_it_ends_as_seen_from_the_body(place, ahead_m, seed):
+def test_beam_is_assigned_to_sector_of_its_end_point(place, ahead_m, seed):
     body = msgspec.structs.replace(TASK.body, lidar_x_m=ahead_m)
     rng = np.random.default_rng(seed)
     ranges = rng.uniform(-1, 8, (3, 40))
@@ -138,8 +140,8 @@ def test_a_beam_counts_where_it_ends_as_seen_from_the_body(place, ahead_m, seed)
 
 @settings(max_examples=60)
 @given(st.lists(st.sampled_from([0.5, 1.5, None]), min_size=4, max_size=24))
-def test_what_no_beam_ended_in_is_as_near_as_what_is_beside_it(given):
-    """Between known sectors, a few of them; all around the circle, which has no first sector."""
+def test_empty_sectors_take_nearest_neighbour_clearance(given):
+    """Only gaps of a few sectors are filled, also across the first sector."""
     count = len(given)
     found = with_unseen(np.array([given], np.float64), 4.0)[0]
     for sector, value in enumerate(given):
@@ -156,17 +158,19 @@ def test_what_no_beam_ended_in_is_as_near_as_what_is_beside_it(given):
             assert found[sector] == 4.0
         else:
             known = [given[(sector - sides[0]) % count], given[(sector + sides[1]) % count]]
-            assert found[sector] == min(one for one in known if one is not None)
+            assert found[sector] == min(
+                clearance_m for clearance_m in known if clearance_m is not None
+            )
 
 
-def test_two_lidars_at_corners_see_what_one_in_the_middle_sees():
-    """And neither alone does."""
+def test_two_corner_lidars_match_one_central_lidar():
+    """Neither corner lidar alone matches."""
 
-    def seen_in(drive: Corridor, text: str) -> Any:
+    def seen_in(drive: CorridorDrive, text: str) -> Any:
         return sectors_of(steps_of(parse_profile(text, where="p"), drive.topics()))
 
-    one = Corridor(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi)
-    expected, found = seen_in(one, WAREHOUSE), seen_in(Corridor(), two_lidars())
+    central = CorridorDrive(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi)
+    expected, found = seen_in(central, WAREHOUSE), seen_in(CorridorDrive(), two_lidars())
     assert found.shape == expected.shape
     assert len(found) > 10
     apart_m = np.abs(found - expected)
@@ -179,12 +183,12 @@ def test_two_lidars_at_corners_see_what_one_in_the_middle_sees():
         alone = alone.replace("/scan_front", topic)
         alone = alone.replace(f"[{FRONT[0]}, {FRONT[1]}]", f"[{place[0]}, {place[1]}]")
         alone = alone.replace(f"lidar_yaw_rad = {FRONT[2]}", f"lidar_yaw_rad = {place[2]}")
-        seen = seen_in(Corridor(), alone)
+        seen = seen_in(CorridorDrive(), alone)
         assert (np.abs(seen - expected) < 0.05).mean() < 0.9
 
 
-def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path):
-    class Silenced(Corridor):
+def test_tick_without_one_lidar_is_dropped(tmp_path):
+    class Silenced(CorridorDrive):
         def topics(self) -> dict[str, TopicColumns]:
             found = super().topics()
             rear = found["/scan_rear"]
@@ -195,18 +199,18 @@ def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path):
     reasons = Counter(steps.problem)
     assert reasons["scan_2: stale"] > 10
     assert reasons[""] > 5
-    absent = Corridor(mounted=(("/scan_front", FRONT),)).bag(tmp_path / "absent")
+    absent = CorridorDrive(mounted=(("/scan_front", FRONT),)).bag(tmp_path / "absent")
     with pytest.raises(RecordingError, match="/scan_rear"):
         steps_in(absent, two_lidars())
 
 
-def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path):
-    bag, text = Corridor().bag(tmp_path / "bag"), two_lidars()
+def test_live_observer_and_ingest_agree_on_two_lidars(tmp_path):
+    bag, text = CorridorDrive().bag(tmp_path / "bag"), two_lidars()
     assert seen_alike(bag, parse_profile(text, where="p"), steps_in(bag, text))[""] > 10
 
 
-def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):
-    bag, profile = Corridor().bag(tmp_path / "bag"), parse_profile(two_lidars(), where="p")
+def test_moment_shows_joined_scan_from_centre(tmp_path):
+    bag, profile = CorridorDrive().bag(tmp_path / "bag"), parse_profile(two_lidars(), where="p")
     with open_recording(bag) as recording:
         aligned = align_inputs(profile, read_topics(recording, profile, reduced=False))
         scans = seen_of(aligned, 1_700_000_001 * 10**9, 1_700_000_003 * 10**9).scans
@@ -214,15 +218,15 @@ def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path):
     for scan in scans:
         assert scan is not None
         back = np.flatnonzero(np.isfinite(scan.ranges_m))
-        assert len(back) > 500  # all around: one lidar has three quarters of its beams
+        assert len(back) > 500  # all around: a single lidar covers three quarters
         bearing = scan.angle_min_rad + scan.angle_increment_rad * back
         y = 1.0 + scan.ranges_m[back] * np.sin(bearing + profile.task.body.lidar_yaw_rad)
         assert y.min() > RIGHT_M - 0.05
         assert y.max() < LEFT_M + 0.05
 
 
-def test_a_scan_made_of_the_others_is_the_one(tmp_path):
-    class Joined(Corridor):
+def test_merged_scan_topic_is_preferred(tmp_path):
+    class Joined(CorridorDrive):
         def topics(self) -> dict[str, TopicColumns]:
             found = super().topics()
             times_s = np.arange(0, self.duration_s, 0.1)
@@ -230,18 +234,18 @@ def test_a_scan_made_of_the_others_is_the_one(tmp_path):
 
     bag = Joined(12.0).bag(tmp_path / "bag")
     profile = proposed(bag, tmp_path / "p.toml", codes=(0, 3))
-    assert {name: one.topic for name, one in profile.inputs.scans.items()} == {"scan": "/z_scan"}
+    assert {name: scan.topic for name, scan in profile.inputs.scans.items()} == {"scan": "/z_scan"}
     assert profile.inputs.scans["scan"].lidar_at_m is None
 
 
-def test_one_lidar_beside_the_middle_has_its_place(tmp_path):
-    """That it is beside the middle was said, and ignored."""
-    bag = Corridor(12.0, mounted=(("/scan", FRONT),)).bag(tmp_path / "bag")
+def test_off_centre_lidar_keeps_its_mounting(tmp_path):
+    """The mounting off centre used to be reported and ignored."""
+    bag = CorridorDrive(12.0, mounted=(("/scan", FRONT),)).bag(tmp_path / "bag")
     profile = proposed(bag, tmp_path / "p.toml", codes=(0, 3))
     scan = profile.inputs.scans["scan"]
     assert scan.lidar_at_m == pytest.approx(FRONT[:2], abs=1e-3)
     assert scan.optional
-    lidar = profile.robot.lidar  # in the middle, turned as it is
+    lidar = profile.robot.lidar  # in the middle, with its own yaw
     middle = (lidar.angle_min_rad + lidar.angle_max_rad) / 2
     assert middle == pytest.approx(FRONT[2], abs=0.02)
     assert lidar.angle_max_rad - lidar.angle_min_rad == pytest.approx(THREE_QUARTERS, abs=0.02)
@@ -264,7 +268,7 @@ def test_one_lidar_beside_the_middle_has_its_place(tmp_path):
         (two_lidars().replace(f"= {REAR[2]}", "= -135.0"), "lidar_yaw_rad"),
     ],
 )
-def test_lidars_that_do_not_go_together_are_refused(text, reported):
-    with pytest.raises(ConfigError) as refused:
+def test_inconsistent_lidars_are_rejected(text, reported):
+    with pytest.raises(ConfigError) as error:
         parse_profile(text, where="p")
-    assert reported in str(refused.value)
+    assert reported in str(error.value)

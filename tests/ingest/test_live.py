@@ -1,4 +1,4 @@
-"""A policy on a running robot: what it sees is what an ingest stores, and it acts as in torch."""
+"""A policy on a running robot: its observations equal those of an ingest, its actions torch's."""
 
 import json
 import sys
@@ -35,11 +35,11 @@ GOALS = ("[inputs.goal]", "[inputs.plan]", 'goal.source = "logged"')
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an exported policy that never learnt anything: which one it is does not matter."""
-    return exported(tmp_path_factory.mktemp("runs"))
+    """Return an exported, untrained policy."""
+    return export_policy(tmp_path_factory.mktemp("runs"))
 
 
-def exported(folder: Path, profile: str = "warehouse_amr") -> Path:
+def export_policy(folder: Path, profile: str = "warehouse_amr") -> Path:
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     from restock.train.evaluation.onnx_policy import export_onnx
@@ -51,14 +51,14 @@ def exported(folder: Path, profile: str = "warehouse_amr") -> Path:
 
 @pytest.mark.long
 def test_live_observations_equal_those_of_ingest(tmp_path):
-    """Of a task with tracks and entries of its own, which are the last 20."""
+    """The task has tracks and observation entries of its own, which are the last 20."""
     nearing = "lag(clearance_m, 2) OVER episode - clearance_m"
     own = f'observed = {{ nearing = "{nearing}", go = "goal_distance_m" }}\n'
     text = profile_toml(PROFILE).replace("\n[task]\n", f"\n[task]\ntracks = 3\n{own}")
     (tmp_path / "tracking.toml").write_text(text)
     profile = load_profile(tmp_path / "tracking.toml")
-    policy = PolicyFile(exported(tmp_path, str(tmp_path / "tracking.toml")))
-    decisions = {one.log_time_ns: one for one in play(Pilot(policy, None), BAG)}
+    policy = PolicyFile(export_policy(tmp_path, str(tmp_path / "tracking.toml")))
+    decisions = {played.log_time_ns: played for played in play(Pilot(policy, None), BAG)}
     assert "rclpy" not in sys.modules
 
     ingest(BAG, profile, store=StoreWriter(tmp_path / "store"))
@@ -78,18 +78,18 @@ def test_live_observations_equal_those_of_ingest(tmp_path):
     live = np.stack([decisions[at].decision.observed.observation for at in times])
     assert not any(decisions[at].decision.reason for at in times)
     np.testing.assert_allclose(live[:, :-20], stored[:, :-20], rtol=1e-6, atol=1e-6)
-    # A running robot knows its clock's offset within microseconds.
+    # A running robot knows the offset of its clock within microseconds.
     np.testing.assert_allclose(live[:, -20:], stored[:, -20:], atol=1e-4)
     greedy, _ = GreedyPolicy(kept_network(task=profile.task)).act(None, live)
     assert [decisions[at].decision.action for at in times] == greedy.tolist()
     assert len(set(greedy.tolist())) > 1
     assert [decisions[at].drove for at in times] == rows["action"].to_pylist()
-    # Without a limiter the command is the action table's.
-    at = decisions[times[0]].decision
-    assert at.command == at.proposal == profile.task.actions[at.action]
+    # Without a limiter the command is that of the action table.
+    decision = decisions[times[0]].decision
+    assert decision.command == decision.proposal == profile.task.actions[decision.action]
 
 
-def test_a_recording_with_a_message_cut_short_cannot_be_played(policy, tmp_path):
+def test_recording_with_truncated_message_cannot_be_played(policy, tmp_path):
     bag = tmp_path / "bag"
     with Writer(bag, version=9) as writer:
         to = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=typestore())
@@ -99,22 +99,22 @@ def test_a_recording_with_a_message_cut_short_cannot_be_played(policy, tmp_path)
 
 
 @pytest.mark.long
-def test_a_recording_is_played_at_the_shell(policy, tmp_path, capsys):
+def test_node_command_plays_a_recording(policy, tmp_path, capsys):
     assert run_node([str(policy), "--on", str(BAG)]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["decisions"] > 700
-    assert 0 < said["latency_ms"]["p50"] <= said["latency_ms"]["p99"]
-    assert 0 < said["agreement"] < 1
-    assert said["limited"]
-    assert not said["unreadable"]
-    # Refused in words: no recording, no policy, no ROS.
+    report = json.loads(capsys.readouterr().out)
+    assert report["decisions"] > 700
+    assert 0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
+    assert 0 < report["agreement"] < 1
+    assert report["limited"]
+    assert not report["unreadable"]
+    # A missing recording, policy or ROS is reported.
     assert run_node([str(policy), "--on", str(tmp_path / "none")]) == 2
     assert run_node([str(tmp_path / "none.onnx"), "--on", str(BAG)]) == 2
     assert run_node([str(policy)]) == 2
-    said = capsys.readouterr().err
-    assert "none: no such file or folder" in said
-    assert "none.onnx: no such file" in said
-    assert "needs ROS 2" in said
+    stderr = capsys.readouterr().err
+    assert "none: no such file or folder" in stderr
+    assert "none.onnx: no such file" in stderr
+    assert "needs ROS 2" in stderr
 
 
 def stamped(stamp_ns: int, **fields: Any) -> SimpleNamespace:
@@ -127,7 +127,7 @@ def odometry(stamp_ns: int, speed_mps: float) -> SimpleNamespace:
     return stamped(stamp_ns, twist=SimpleNamespace(twist=twist))
 
 
-def test_a_message_off_the_clock_is_left_out_and_counted():
+def test_message_off_the_clock_is_dropped_and_counted():
     observer = LiveObserver(PROFILE)
     for index in range(5):
         observer.receive("/odom", odometry(index * 10**8, 1.0), index * 10**8 + 2_000_000)
@@ -136,7 +136,7 @@ def test_a_message_off_the_clock_is_left_out_and_counted():
     assert observer.offset_ns == 2_000_000
 
 
-def test_memory_does_not_grow_with_messages():
+def test_observer_memory_does_not_grow():
     observer = LiveObserver(PROFILE)
     for index in range(1000):
         observer.receive("/odom", odometry(index * 10**7, 1.0), index * 10**7)
@@ -145,12 +145,12 @@ def test_memory_does_not_grow_with_messages():
     assert sum(len(held) for held in observer._buffers.values()) < 30
 
 
-def test_a_profile_of_what_no_robot_gives_is_refused(tmp_path: Path) -> None:
+def test_observer_rejects_frames_and_hindsight_goals(tmp_path: Path) -> None:
     framed = msgspec.structs.replace(PROFILE, frames=Frames())
     file = tmp_path / "hindsight.toml"
     without_goals = WAREHOUSE.split("[inputs.goal]")[0]
     file.write_text(f'{without_goals}\n[goal]\nsource = "hindsight"\n')
     for profile, needs in ((framed, ("[inputs.pose]",)), (load_profile(str(file)), GOALS)):
-        with pytest.raises(ConfigError) as refused:
+        with pytest.raises(ConfigError) as error:
             LiveObserver(profile)
-        assert all(each in str(refused.value) for each in needs)
+        assert all(text in str(error.value) for text in needs)

@@ -1,4 +1,4 @@
-"""Memory grows with what a profile keeps of a recording, not with the recording's bytes."""
+"""Memory grows with the fields that a profile needs, not with the size of the recording."""
 
 import json
 import subprocess
@@ -20,11 +20,11 @@ from restock.ingest.steps.align import align
 from restock.ingest.steps.clocks import STAMP, topic_clock
 
 FEW, MANY = 10, 250  # images of 400 kB
-# Of growth, where the larger recording holds 96 MB more. What is read ahead, some 25 MB however
-# large the recording (the same with 400 MB), differs by an allocation or two.
+# Allowed growth; the larger recording holds 96 MB more. Read-ahead takes some 25 MB at any size
+# (the same with 400 MB), give or take an allocation.
 ALLOWED_MB = 48
 
-# Ingests each recording in turn, and says the peak of this process' memory after each.
+# Ingests each recording in turn and prints the peak memory of the process after each.
 MEASURE = """
 import json, re, sys
 from restock.ingest.pipeline import ingest
@@ -51,7 +51,7 @@ def recording(kind: str, folder: Path, images: int) -> Path:
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read peaks from")
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "zstd file"])
-def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_recording_size(kind: str, tmp_path: Path) -> None:
     paths = [recording(kind, tmp_path / str(images), images) for images in (FEW, MANY)]
     done = subprocess.run(
         [sys.executable, "-c", MEASURE, *map(str, paths)], capture_output=True, check=True
@@ -61,9 +61,9 @@ def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path:
     assert after - before < ALLOWED_MB
 
 
-def most_memory(work: Callable[[], Any]) -> int:
-    """Return the peak bytes that some work adds, as NumPy counts them."""
-    work()  # what is kept for the next time is not of the work
+def peak_memory(work: Callable[[], Any]) -> int:
+    """Return the peak bytes that a call allocates, as NumPy counts them."""
+    work()  # fills caches, which do not count
     tracemalloc.start()
     try:
         work()
@@ -72,7 +72,7 @@ def most_memory(work: Callable[[], Any]) -> int:
         tracemalloc.stop()
 
 
-def test_aligning_takes_few_arrays_beside_the_times() -> None:
+def test_alignment_memory_is_few_times_the_stamps() -> None:
     count = 200_000
     rng = np.random.default_rng(1)
     stamp = np.arange(count, dtype=np.int64) * 5_000_000 + 10**18
@@ -80,7 +80,8 @@ def test_aligning_takes_few_arrays_beside_the_times() -> None:
     imu = TopicColumns(log, log, {STAMP: stamp})
     odometry = TopicColumns(log[::4], log[::4], {STAMP: stamp[::4]})
     topics, clock = {"/imu": imu, "/odom": odometry}, Clock(alignment="header.stamp")
-    assert most_memory(lambda: align(topics, clock)) < 7 * stamp.nbytes  # 5; it was 10
-    assert most_memory(lambda: topic_clock("/imu", imu)) < 5 * stamp.nbytes  # 3; 7
+    assert peak_memory(lambda: align(topics, clock)) < 7 * stamp.nbytes  # measured 5, formerly 10
+    # measured 3, formerly 7
+    assert peak_memory(lambda: topic_clock("/imu", imu)) < 5 * stamp.nbytes
     (segment,), _ = align(topics, clock)
     assert np.shares_memory(segment.topics["/imu"].stamp_ns, stamp)

@@ -1,4 +1,4 @@
-"""A container that this test adds: one class, one row of `CONTAINERS`, and nothing else."""
+"""A container added by this test: one class and one row of `CONTAINERS`."""
 
 import json
 from collections.abc import Collection, Iterator
@@ -13,7 +13,7 @@ MAGIC = b"#JSONLINES\n"
 
 
 class JsonLines(Storage):
-    """A line a message: its time and its JSON; all of one topic."""
+    """Container of one topic with one line per message, its time and its JSON."""
 
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = no_progress) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ ROW = Container(
 )
 
 
-def test_a_container_is_one_class_and_one_row(tmp_path, monkeypatch):
+def test_new_container_needs_one_class_and_one_row(tmp_path, monkeypatch):
     monkeypatch.setattr(opening, "CONTAINERS", (*opening.CONTAINERS, ROW))
     lines = [json.dumps({"ns": ns, "message": {"mps": ns / 10}}) for ns in (10, 20, 30)]
     path = tmp_path / "run.jsonl"

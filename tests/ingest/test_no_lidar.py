@@ -1,4 +1,4 @@
-"""A robot without a lidar: its clearance is unknown, and so is every condition that needs it."""
+"""Robots without a lidar: clearance and every condition that needs it are unknown."""
 
 import re
 from collections.abc import Mapping
@@ -24,7 +24,13 @@ from restock.replay.store.audit import load_thresholds, run_audits, shipped_audi
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import trace_row
 
-NEEDS_ONE = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
+LIDAR_CONDITIONS = [
+    "blocked_aisle",
+    "closing_traffic",
+    "near_collision",
+    "plan_blocked",
+    "recovery",
+]
 SCAN = re.search(r"\[inputs\.scan\].*?\n\n", WAREHOUSE, re.DOTALL)
 assert SCAN is not None
 BLIND = parse_profile(WAREHOUSE.replace(SCAN[0], ""), where="blind.toml")
@@ -48,14 +54,14 @@ share = "natural"
 
 
 class BlindDrive(Drive):
-    """The same drive of a robot that has no lidar."""
+    """The default drive of a robot without a lidar."""
 
     drop = ("/scan",)
 
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return recordings: `seeing` with a scan, `blind` without."""
+    """Return a folder of recordings: `seeing` with a scan, `blind` without."""
     folder = tmp_path_factory.mktemp("drives")
     write_bag(Drive(), folder / "seeing")
     write_bag(BlindDrive(duration_s=9.0), folder / "blind")
@@ -64,12 +70,12 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def blind(drives: Path) -> tuple[Path, IngestResult]:
-    """Return a store of the drive without a lidar."""
+    """Return a store of the drive without a lidar, and the ingest result."""
     store = drives / "store"
     return store, ingest(drives / "blind", BLIND, store=StoreWriter(store))
 
 
-def test_a_profile_without_a_scan_has_no_sectors():
+def test_profile_without_scan_has_no_sectors():
     assert "sectors = 36" in WAREHOUSE
     assert (BLIND.task.sectors, BLIND.task.lidar) == (0, False)
     lidar = [n for n in load_profile("warehouse_amr").task.observation_names if "deg" in n]
@@ -79,7 +85,7 @@ def test_a_profile_without_a_scan_has_no_sectors():
     assert BLIND.task.observation_size == len(names) - 72
 
 
-def test_rows_hold_null_and_what_else_the_robot_knows(drives, blind):
+def test_clearance_columns_are_null_without_lidar(drives, blind):
     path, outcome = blind
     with Store(path) as store:
         rows = store.sql("FROM transitions ORDER BY step_index").to_arrow_table()
@@ -89,25 +95,25 @@ def test_rows_hold_null_and_what_else_the_robot_knows(drives, blind):
     observation = np.stack(rows["observation"].to_numpy())
     assert observation.shape == (len(rows), BLIND.task.observation_size)
     assert np.isfinite(observation).all()
-    assert sorted(unknown) == [(name, "no lidar") for name in NEEDS_ONE]
-    assert not set(outcome.conditions) & set(NEEDS_ONE)
+    assert sorted(unknown) == [(name, "no lidar") for name in LIDAR_CONDITIONS]
+    assert not set(outcome.conditions) & set(LIDAR_CONDITIONS)
     assert {*outcome.conditions, *outcome.exposures} >= {"wheel_slip", "slippery_floor"}
     for row in rows.to_pylist(maps_as_pydicts="strict"):
-        assert not {*row["probabilities"]} & set(NEEDS_ONE)
+        assert not {*row["probabilities"]} & set(LIDAR_CONDITIONS)
 
     seeing = ingest(drives / "seeing", load_profile("warehouse_amr"), store=None)
     assert seeing.manifest["unknown_conditions"] == []
 
 
-def test_a_traced_row_has_no_term_of_what_a_lidar_sees(blind):
+def test_traced_reward_has_no_clearance_term(blind):
     path, _ = blind
     with Store(path) as store:
         ((row,),) = store.sql("SELECT min(transition_id) FROM transitions").fetchall()
     assert trace_row(path, str(row)).origin.reward_parts["tight"] == 0.0
 
 
-def test_an_unseen_wall_beside_the_robot_costs_nothing(tmp_path):
-    """`tight` is 0 where clearance is unknown; with the lidar the same steps cost .05 each."""
+def test_unknown_clearance_costs_no_reward(tmp_path):
+    """The term `tight` is 0 if clearance is unknown; with the lidar each step costs 0.05."""
 
     class Tight(Drive):
         def topics(self) -> Mapping[str, TopicColumns]:
@@ -124,8 +130,8 @@ def test_an_unseen_wall_beside_the_robot_costs_nothing(tmp_path):
     assert rewards["none"] - rewards["lidar"] == pytest.approx(np.full(29, 0.05), abs=1e-6)
 
 
-def test_an_optional_scan_that_is_not_there_makes_the_same_task(drives, blind, tmp_path):
-    """Never a clearance that was not measured, and never rows of two kinds under one task."""
+def test_missing_optional_scan_gives_task_without_lidar(drives, blind, tmp_path):
+    """A task never mixes rows with and without measured clearance."""
     _, first = blind
     second = ingest(drives / "blind", OPTIONAL, store=StoreWriter(tmp_path / "store"))
     assert second.manifest["task_hash"] == first.manifest["task_hash"] == BLIND.task.hash
@@ -136,14 +142,14 @@ def test_an_optional_scan_that_is_not_there_makes_the_same_task(drives, blind, t
     assert again.status == "unchanged"
 
 
-def test_a_policy_that_sees_does_not_act_before_the_first_scan():
-    """On a robot an optional scan may be late: every way free would be a guess."""
+def test_steps_before_first_optional_scan_are_unusable():
+    """On a robot an optional scan may be late; free space would be a guess."""
     steps = steps_of(OPTIONAL, BlindDrive().topics())
     assert set(steps.problem) == {"scan: not yet received"}
     assert set(steps_of(BLIND, BlindDrive().topics()).problem) == {""}
 
 
-def test_nothing_is_counted_of_what_no_row_tells(blind):
+def test_unknown_conditions_have_no_counts(blind):
     path, _ = blind
     with Store(path) as store:
         held = dict(store.sql("SELECT condition, rows_held FROM coverage_by_condition").fetchall())
@@ -153,17 +159,21 @@ def test_nothing_is_counted_of_what_no_row_tells(blind):
         findings = run_audits(store.connection, shipped_audits(), load_thresholds())
     outcomes = {"blocked_aisle", "near_collision", "recovery"}
     assert {name for name, rows in held.items() if rows is None} == outcomes
-    assert {line for line in cells if line[2] is None} == {(one, None, None) for one in outcomes}
+    assert {line for line in cells if line[2] is None} == {(name, None, None) for name in outcomes}
     assert ("wheel_slip",) in missing
     assert not {(name,) for name in outcomes} & set(missing)
-    assert {name for name, rows in observed.items() if rows is None} == set(NEEDS_ONE) - outcomes
+    assert {name for name, rows in observed.items() if rows is None} == set(
+        LIDAR_CONDITIONS
+    ) - outcomes
     found = {finding.audit.name: finding for finding in findings}
     assert found["unknown_conditions"].status == "warn"
-    assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(NEEDS_ONE)
+    assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(
+        LIDAR_CONDITIONS
+    )
     assert not outcomes & {line["condition"] for line in found["rare_condition"].sample}
 
 
-def test_one_drive_with_a_lidar_and_zero_is_a_count_again(drives, tmp_path):
+def test_one_drive_with_lidar_restores_zero_counts(drives, tmp_path):
     writer = StoreWriter(tmp_path / "store")
     ingest(drives / "blind", BLIND, store=writer)
     ingest(drives / "seeing", load_profile("warehouse_amr"), store=writer)
@@ -171,10 +181,10 @@ def test_one_drive_with_a_lidar_and_zero_is_a_count_again(drives, tmp_path):
         query = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
         assert store.sql(query).fetchall() == [(0,)]
         assert store.sql("FROM untold_conditions").fetchall() == []
-        assert len(store.sql("FROM unknown_conditions").fetchall()) == len(NEEDS_ONE)
+        assert len(store.sql("FROM unknown_conditions").fetchall()) == len(LIDAR_CONDITIONS)
 
 
-def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
+def test_quota_on_unknown_condition_reports_reason(blind):
     path, _ = blind
     with Store(path) as store:
         known = [*store.conditions(), *store.exposures()]
@@ -187,7 +197,7 @@ def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
             plan_panel(store.connection, refusing, known)
 
 
-def test_the_limiter_without_a_lidar_limits_speed_alone():
+def test_limiter_without_lidar_limits_only_speed():
     limits = Limits.of(BLIND.task)
     fast = np.array([[0.5, 0.0], [9.0, 0.0]])
     limited = limit(limits, fast, np.zeros((2, 0)), np.array([[0.5, 0.0], [1.0, 0.0]]))
@@ -195,7 +205,7 @@ def test_the_limiter_without_a_lidar_limits_speed_alone():
     assert limited.command[:, 0].tolist() == [0.5, limits.fastest[0]]
 
 
-def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path):
+def test_proposal_without_lidar_is_ingestible(drives, tmp_path):
     profile = tmp_path / "mine.toml"
     proposed(drives / "blind", profile, codes=(0, 3))
     assert "sectors = 0  # no lidar" in profile.read_text()
