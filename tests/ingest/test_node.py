@@ -1,4 +1,4 @@
-"""The ROS 2 node on a stub of rclpy: it drives to its goal and stops for what is unreliable."""
+"""The ROS 2 node on a stub of rclpy: it drives to its goal and stops for unreliable input."""
 
 import json
 import time
@@ -41,31 +41,33 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return follower_onnx(tmp_path_factory.mktemp("policy") / "p.onnx", PROFILE)
 
 
-def started(policy: Path, *, drive: bool = True, **parameters: Any) -> tuple[Graph, Any]:
+def configured_node(policy: Path, *, drive: bool = True, **parameters: Any) -> tuple[Graph, Any]:
     graph = Graph(parameters=parameters)
     node = lifecycle_node(graph.ros(), policy, drive=drive)
     assert node.trigger_configure() is Returned.SUCCESS, graph.logged
     return graph, node
 
 
-def driven(robot: TwinRobot, each: Callable[[int], None] | None = None, steps: int = 240) -> int:
-    """Return steps until the episode ended; `each` is called before each decision."""
+def drive_until_done(
+    robot: TwinRobot, before_decision: Callable[[int], None] | None = None, steps: int = 240
+) -> int:
+    """Return the steps until the episode ended; `before_decision` is called at each step."""
     for step in range(steps):
         robot.sense()
-        if each is not None:
-            each(step)
+        if before_decision is not None:
+            before_decision(step)
         robot.graph.fire()
         if robot.drive():
             return step + 1
     return steps
 
 
-def driving(policy: Path, steps: int = 8) -> tuple[Graph, Any, TwinRobot]:
+def drive_some_steps(policy: Path, steps: int = 8) -> tuple[Graph, Any, TwinRobot]:
     """Return the graph, the active node, and a robot that it drove for some steps."""
-    graph, node = started(policy)
+    graph, node = configured_node(policy)
     node.trigger_activate()
     robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=steps)
+    drive_until_done(robot, steps=steps)
     return graph, node, robot
 
 
@@ -73,85 +75,85 @@ def speeds(graph: Graph, topic: str = COMMAND) -> list[tuple[float, float]]:
     return [(message.linear.x, message.angular.z) for message in graph.of(topic)]
 
 
-def test_it_drives_the_twin_to_its_goal(policy: Path) -> None:
-    graph, node = started(policy)
+def test_node_drives_twin_to_its_goal(policy: Path) -> None:
+    graph, node = configured_node(policy)
     assert node.trigger_activate() is Returned.SUCCESS
     robot, seen = TwinRobot(graph, SPEC), []
 
-    def look(_: int) -> None:
+    def record_observation(_: int) -> None:
         seen.append(robot.env.observation[0])
 
     pilot, live = node.policy.pilot, []
     decide = pilot.decide
     pilot.decide = lambda now_ns: live.append(decide(now_ns)) or live[-1]
-    steps = driven(robot, look)
+    steps = drive_until_done(robot, record_observation)
     assert bool(robot.info["success"][0])
     assert len(live) == steps == len(graph.of(COMMAND))
-    assert not [one.reason for one in live if one.reason]
-    observed = np.stack([one.observed.observation for one in live])
+    assert not [decision.reason for decision in live if decision.reason]
+    observed = np.stack([decision.observed.observation for decision in live])
     np.testing.assert_allclose(observed, np.stack(seen), atol=2e-4)
-    assert speeds(graph) == [one.command for one in live]
-    who = json.loads(graph.of("/behaviour_policy")[0].data)
-    assert who == {"policy": "restock", "version": "follower 1"}
+    assert speeds(graph) == [decision.command for decision in live]
+    driver = json.loads(graph.of("/behaviour_policy")[0].data)
+    assert driver == {"policy": "restock", "version": "follower 1"}
     graph.fire(steady=True)
-    said = graph.of("/diagnostics")[-1].status[0]
-    assert {entry.key: entry.value for entry in said.values}["decisions"] == str(steps)
+    diagnostics = graph.of("/diagnostics")[-1].status[0]
+    assert {entry.key: entry.value for entry in diagnostics.values}["decisions"] == str(steps)
 
 
-def test_it_commands_only_when_active(policy: Path) -> None:
-    graph, node = started(policy)
+def test_node_commands_only_when_active(policy: Path) -> None:
+    graph, node = configured_node(policy)
     robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=3)
+    drive_until_done(robot, steps=3)
     assert not graph.of(COMMAND)  # inactive
     node.trigger_activate()
-    driven(robot, steps=8)
+    drive_until_done(robot, steps=8)
     assert speeds(graph)[-1][0] > 0
     assert node.trigger_deactivate() is Returned.SUCCESS
     assert speeds(graph)[-1] == (0.0, 0.0)
     assert graph.of("/behaviour_policy")[-1].data == PROFILE.behaviour_policy
     count = len(graph.of(COMMAND))
-    driven(robot, steps=2)
+    drive_until_done(robot, steps=2)
     graph.fire(steady=True)
     assert len(graph.of(COMMAND)) == count
-    # Once more, and from active straight to the end.
+    # Activate again, and shut down from the active state.
     node.trigger_activate()
-    driven(robot, steps=4)
+    drive_until_done(robot, steps=4)
     assert node.trigger_shutdown() is Returned.SUCCESS
     assert speeds(graph)[-1] == (0.0, 0.0)
     assert not graph.timers
     assert not any(topic != COMMAND and heard for topic, heard in graph.heard.items())
 
 
-def test_a_kept_message_is_asked_for_while_a_publisher_keeps_it(policy: Path) -> None:
-    """The stub fails where a plain publisher is asked: there rclpy and the publisher warn."""
-    keeps, goal = QoS(1, durability=Durability.TRANSIENT_LOCAL), "geometry_msgs/msg/PoseStamped"
+def test_latched_message_is_requested_only_from_latching(policy: Path) -> None:
+    """The stub fails if a volatile publisher is asked for kept messages; rclpy only warns."""
+    latching, goal = QoS(1, durability=Durability.TRANSIENT_LOCAL), "geometry_msgs/msg/PoseStamped"
     for earlier in (True, False):
         graph = Graph()
-        graph.send("/goal_pose", message_class(goal)(), keeps if earlier else VOLATILE)
+        graph.send("/goal_pose", message_class(goal)(), latching if earlier else VOLATILE)
         node = lifecycle_node(graph.ros(), policy)
         assert node.trigger_configure() is Returned.SUCCESS, graph.logged
-        kept = node.policy.pilot.observer._buffers["/goal_pose"]
-        assert len(kept) == earlier
+        buffer = node.policy.pilot.observer._buffers["/goal_pose"]
+        assert len(buffer) == earlier
         assert len(graph.heard["/goal_pose"]) == 1 + earlier
-        graph.offered["/goal_pose"] = VOLATILE if earlier else keeps
+        graph.offered["/goal_pose"] = VOLATILE if earlier else latching
         graph.fire(steady=True)
-        assert len(kept) == 1
+        assert len(buffer) == 1
         assert len(graph.heard["/goal_pose"]) == 2 - earlier
-        assert len(graph.heard["/scan"]) == 1  # no other topic's last message counts
+        assert len(graph.heard["/scan"]) == 1  # other topics have no extra subscription
     assert node.trigger_shutdown() is Returned.SUCCESS
     assert not any(graph.heard.values())
 
 
-def test_configured_again_it_has_the_new_limits(tmp_path: Path) -> None:
-    def limited(name: str, speed_mps: float) -> Path:
+def test_reconfiguration_applies_new_limits(tmp_path: Path) -> None:
+    def limited_policy(name: str, speed_mps: float) -> Path:
         limiter = Limiter(max_speed_mps=speed_mps, reaction_s=0.0)
         profile = msgspec.structs.replace(PROFILE, limiter=limiter)
         return follower_onnx(tmp_path / f"{name}.onnx", profile)
 
-    graph, node = started(limited("first", 0.9))
+    graph, node = configured_node(limited_policy("first", 0.9))
     limits = node.policy.pilot.limits
-    assert (limits.fastest[0], limits.reaction_s) == (0.9, 0.0)  # 0 s is a time, and given
-    node._values["policy"] = str(limited("second", 0.3))  # as `ros2 param set` does
+    assert (limits.fastest[0], limits.reaction_s) == (0.9, 0.0)  # 0 s is a valid time
+    node._values["policy"] = str(limited_policy("second", 0.3))  # as `ros2 param set` does
     node._values["limiter_stop_m"] = 0.5
     node.trigger_cleanup()
     assert node.trigger_configure() is Returned.SUCCESS, graph.logged
@@ -159,20 +161,20 @@ def test_configured_again_it_has_the_new_limits(tmp_path: Path) -> None:
     assert (limits.fastest[0], limits.stop_m) == (0.3, 0.5)
 
 
-def test_silence_stale_inputs_and_a_stalled_timer_are_stops(policy, monkeypatch):
-    graph, node = started(policy)
+def test_node_stops_for_silence_stale_input_and_stalled_timer(policy, monkeypatch):
+    graph, node = configured_node(policy)
     node.trigger_activate()
     graph.fire()
     assert speeds(graph) == [(0.0, 0.0)]
     assert "nothing received yet" in node.policy.pilot.reason
     robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=8)
+    drive_until_done(robot, steps=8)
     assert speeds(graph)[-1][0] > 0
-    graph.now_ns += 2 * 10**9  # nothing comes any more
+    graph.now_ns += 2 * 10**9  # no messages arrive any more
     graph.fire()
     assert speeds(graph)[-1] == (0.0, 0.0)
     assert "stale" in node.policy.pilot.reason
-    driven(robot, steps=3)
+    drive_until_done(robot, steps=3)
     count, later = len(graph.of(COMMAND)), time.monotonic() + 10
     monkeypatch.setattr(time, "monotonic", lambda: later)
     graph.fire(steady=True)
@@ -182,19 +184,19 @@ def test_silence_stale_inputs_and_a_stalled_timer_are_stops(policy, monkeypatch)
     assert graph.of("/diagnostics")[-1].status[0].message == "stalled"
 
 
-def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
-    graph, node, robot = driving(policy)
+def test_node_stops_for_invalid_input_and_counts_it(policy: Path) -> None:
+    graph, node, robot = drive_some_steps(policy)
     pilot, beams = node.policy.pilot, len(robot.env.simulation.bearings_rad)
-    for nothing in (np.nan, 0.0):
-        robot.sense(ranges=np.full(beams, nothing, np.float32))
+    for invalid in (np.nan, 0.0):
+        robot.sense(ranges=np.full(beams, invalid, np.float32))
         graph.fire()
         assert speeds(graph)[-1] == (0.0, 0.0)
         assert pilot.reason == "scan: no beam has a valid range"
         robot.drive()
-    # Another type on a topic: left out.
+    # A message of another type is ignored and counted.
     graph.send("/odom", message_class("std_msgs/msg/Bool")())
     assert pilot.unreadable == {"/odom": 1}
-    # The clock is set back: nothing of before counts.
+    # If the clock is set back, earlier messages are discarded.
     graph.now_ns -= 10**12
     graph.fire()
     assert pilot.reason == "clock: went back"
@@ -204,9 +206,9 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
     assert all(np.isfinite(pair).all() for pair in speeds(graph))
 
 
-def test_it_stops_for_what_is_too_close_to_be_measured(policy: Path) -> None:
-    """-inf in a scan (REP 117), ahead of a robot that drives ahead."""
-    graph, _, robot = driving(policy)
+def test_node_stops_for_minus_infinity_ranges(policy: Path) -> None:
+    """The scan has -inf (REP 117) ahead of a robot that drives ahead."""
+    graph, _, robot = drive_some_steps(policy)
     assert speeds(graph)[-1][0] > 0
     ranges = robot.env.sensing.ranges_m[0].astype(np.float32)
     ranges[np.abs(robot.env.simulation.bearings_rad) < 0.2] = -np.inf
@@ -220,50 +222,50 @@ def test_it_stops_for_what_is_too_close_to_be_measured(policy: Path) -> None:
     assert speeds(graph)[-1][0] > 0
 
 
-def test_messages_ahead_of_its_clock_are_refused_and_reported(policy: Path) -> None:
-    """Taken, the first one would set the clock ahead, and a dead lidar would look alive."""
-    graph, node = started(policy)
+def test_messages_ahead_of_clock_are_rejected_and_reported(policy: Path) -> None:
+    """If accepted, the first one would advance the clock and make a dead lidar look alive."""
+    graph, node = configured_node(policy)
     node.trigger_activate()
     robot, send, ahead_s = TwinRobot(graph, SPEC), graph.send, 3600
 
-    def stamped_ahead(topic: str, message: Any, *offered: Any) -> None:
+    def send_stamped_ahead(topic: str, message: Any, *offered: Any) -> None:
         if topic == "/scan":
             message.header.stamp = stamp(graph.now_ns + round(ahead_s * 1e9))
         send(topic, message, *offered)
 
-    graph.send = stamped_ahead  # type: ignore[method-assign]
-    driven(robot, steps=2)
+    graph.send = send_stamped_ahead  # type: ignore[method-assign]
+    drive_until_done(robot, steps=2)
     assert node.policy.pilot.reason == "nothing received yet on /scan"
-    ahead_s = 0.1  # as by a simulator's clock
-    driven(robot, steps=6)
+    ahead_s = 0.1  # as with a simulator's clock
+    drive_until_done(robot, steps=6)
     assert speeds(graph)[-1][0] > 0
     ahead_s = 0.5
-    driven(robot, steps=4)
+    drive_until_done(robot, steps=4)
     assert node.policy.pilot.reason == "scan: stale"
     assert speeds(graph)[-1] == (0.0, 0.0)
     assert node.policy.pilot.observer.left_out == {}
     graph.fire(steady=True)
-    values = {each.key: each.value for each in graph.of("/diagnostics")[-1].status[0].values}
+    values = {entry.key: entry.value for entry in graph.of("/diagnostics")[-1].status[0].values}
     assert values["ahead of the clock: /scan"] == "6"
 
 
-def test_values_that_overflow_are_a_stop(policy: Path, tmp_path: Path) -> None:
+def test_node_stops_for_overflowing_action_values(policy: Path, tmp_path: Path) -> None:
     import onnx
 
     def enlarge(model: Any) -> None:
-        (weight,) = [each for each in model.graph.initializer if each.name == "weight"]
+        (weight,) = [tensor for tensor in model.graph.initializer if tensor.name == "weight"]
         large = np.full(tuple(weight.dims), 3e38, np.float32)
         weight.CopyFrom(onnx.numpy_helper.from_array(large, "weight"))
 
-    graph, node, _ = driving(changed_policy(policy, tmp_path / "large.onnx", enlarge))
+    graph, node, _ = drive_some_steps(changed_policy(policy, tmp_path / "large.onnx", enlarge))
     assert node.policy.pilot.reason == "policy: the value of its action is not a finite number"
     assert speeds(graph)[-1] == (0.0, 0.0)
 
 
-def test_an_unfit_policy_leaves_it_unconfigured(policy: Path, tmp_path: Path) -> None:
+def test_unsuitable_policy_leaves_node_unconfigured(policy: Path, tmp_path: Path) -> None:
     other = tmp_path / "turtlebot3.toml"
     other.write_text(profile_toml(load_profile("turtlebot3")), encoding="utf-8")
-    for parameters, why in (
+    for parameters, message in (
         ({"profile": str(other)}, "was made for task"),
         ({"policy": str(tmp_path / "none.onnx")}, "no such file"),
         ({"cmd_vel_type": "std_msgs/msg/Bool"}, "neither the profile's command nor a twist"),
@@ -276,12 +278,12 @@ def test_an_unfit_policy_leaves_it_unconfigured(policy: Path, tmp_path: Path) ->
         node = lifecycle_node(graph.ros(), policy)
         assert node.trigger_configure() is Returned.FAILURE
         assert node.state == "unconfigured"
-        assert why in graph.logged[-1]
+        assert message in graph.logged[-1]
         assert not graph.timers
 
 
-def test_parameters_choose_the_command_and_its_limits(policy: Path) -> None:
-    graph, node = started(
+def test_parameters_set_command_topic_and_limits(policy: Path) -> None:
+    graph, node = configured_node(
         policy,
         cmd_vel_topic="/cmd_vel_policy",
         cmd_vel_type="geometry_msgs/msg/TwistStamped",
@@ -289,36 +291,36 @@ def test_parameters_choose_the_command_and_its_limits(policy: Path) -> None:
     )
     node.trigger_activate()
     robot = TwinRobot(graph, SPEC)
-    driven(robot, steps=6)  # what drives is not on /cmd_vel: the robot stands
+    drive_until_done(robot, steps=6)  # the command is not on /cmd_vel, so the robot stands
     sent = graph.of("/cmd_vel_policy")
     assert max(message.twist.linear.x for message in sent) == pytest.approx(0.3)
     assert sent[-1].header.stamp.sec > 0
     assert {message.data for message in graph.of(LIMITER)} & {1}
 
 
-def test_in_shadow_it_commands_nothing(policy, tmp_path, capsys):
-    graph, node = started(policy, drive=False)
+def test_node_commands_nothing_in_shadow(policy, tmp_path, capsys):
+    graph, node = configured_node(policy, drive=False)
     node.trigger_activate()
     robot, twist = TwinRobot(graph, SPEC), message_class("geometry_msgs/msg/Twist")
 
-    def planner_drives(step: int) -> None:
-        """As navigation proposes, but for a stop now and then."""
+    def send_planner_command(step: int) -> None:
+        """Repeat navigation's proposal, with a stop every few steps."""
         command = twist()
         proposed = graph.of("/cmd_vel_nav")[-1]
         if step % 5:
             command.linear.x, command.angular.z = proposed.linear.x, proposed.angular.z
-        drives.append(command)
+        commands.append(command)
 
-    drives: list[Any] = []
+    commands: list[Any] = []
     steps = 0
     while steps < 40:
         robot.sense()
-        planner_drives(steps)
+        send_planner_command(steps)
         graph.fire()
-        graph.send(COMMAND, drives[-1])
+        graph.send(COMMAND, commands[-1])
         robot.drive()
         steps += 1
-    assert len(graph.of(COMMAND)) == steps  # all of them the planner's
+    assert len(graph.of(COMMAND)) == steps  # all of them from the planner
     assert len(graph.of(SHADOW)) == len(graph.of(ACTION)) == steps
     assert not graph.of("/behaviour_policy")
     profile = tmp_path / "with_node.toml"
@@ -336,8 +338,8 @@ def test_in_shadow_it_commands_nothing(policy, tmp_path, capsys):
     assert policies == [PROFILE.behaviour_policy]
 
 
-def test_a_takeover_silences_it_and_its_rows_are_the_operators(policy, tmp_path):
-    graph, node = started(policy)
+def test_takeover_silences_node_and_labels_operator(policy, tmp_path):
+    graph, node = configured_node(policy)
     node.trigger_activate()
     robot = TwinRobot(graph, SPEC)
     button, twist = message_class("std_msgs/msg/Bool"), message_class("geometry_msgs/msg/Twist")
@@ -361,12 +363,14 @@ def test_a_takeover_silences_it_and_its_rows_are_the_operators(policy, tmp_path)
     profile = tmp_path / "with_node.toml"
     profile.write_text(profile_toml(with_node_topics(PROFILE)), encoding="utf-8")
     rows = {}
-    for name, left_out in (("told", ()), ("by the button", ("/behaviour_policy",))):
-        some = Graph(sent=[one for one in graph.sent if one[1] not in left_out])
-        bag, at = some.write(tmp_path / name), tmp_path / f"{name} store"
-        with ingested(bag, profile, at) as store:
+    for name, omitted_topics in (("driver topic", ()), ("button", ("/behaviour_policy",))):
+        partial = Graph(
+            sent=[message for message in graph.sent if message[1] not in omitted_topics]
+        )
+        bag, store_path = partial.write(tmp_path / name), tmp_path / f"{name} store"
+        with ingested(bag, profile, store_path) as store:
             rows[name] = store.sql(
                 "SELECT behaviour_policy, count(*) FROM transitions GROUP BY 1 ORDER BY 1"
             ).fetchall()
-    assert rows["told"] == [("operator", 10), ("restock", 19)]
-    assert dict(rows["by the button"])["operator"] == 10
+    assert rows["driver topic"] == [("operator", 10), ("restock", 19)]
+    assert dict(rows["button"])["operator"] == 10

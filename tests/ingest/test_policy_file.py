@@ -1,4 +1,4 @@
-"""Policy files from strangers: refused before the runtime reads what no policy needs."""
+"""Policy files from strangers: rejected before the runtime reads anything unneeded."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -44,12 +44,12 @@ def weight(model: Any) -> Any:
 
 
 def insert(*nodes: Any, **constants: Any) -> Callable[[Any], None]:
-    """Return a change that computes `nodes` first, of these constants."""
+    """Return a change that inserts `nodes` at the start, with these constants."""
 
     def change(model: Any) -> None:
         model.graph.initializer.extend(array(value, name) for name, value in constants.items())
-        for at, each in enumerate(nodes):
-            model.graph.node.insert(at, each)
+        for at, inserted in enumerate(nodes):
+            model.graph.node.insert(at, inserted)
 
     return change
 
@@ -58,14 +58,14 @@ def assign(key: str, value: str) -> Callable[[Any], None]:
     """Return a change of one metadata entry."""
 
     def change(model: Any) -> None:
-        (entry,) = [each for each in model.metadata_props if each.key == key]
+        (entry,) = [prop for prop in model.metadata_props if prop.key == key]
         entry.value = value
 
     return change
 
 
-def loop(model: Any) -> None:
-    """Add 2^62 rounds of nothing."""
+def add_loop(model: Any) -> None:
+    """Add a loop of 2^62 empty iterations."""
     info, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
     again = node("Identity", ["more"], ["again"])
     body = onnx.helper.make_graph(
@@ -77,23 +77,23 @@ def loop(model: Any) -> None:
     insert(node("Loop", ["rounds", ""], [], body=body), rounds=np.array(2**62))(model)
 
 
-def external(model: Any) -> None:
-    """Have the weights read from another file."""
+def store_externally(model: Any) -> None:
+    """Store the weights in another file."""
     onnx.external_data_helper.set_external_data(weight(model), "/etc/passwd")
     weight(model).ClearField("raw_data")
 
 
-def subgraph(model: Any) -> None:
-    """Give an operator that is allowed a graph as its attribute."""
+def add_subgraph(model: Any) -> None:
+    """Give an allowed operator a graph as its attribute."""
     model.graph.node[-1].attribute.append(onnx.helper.make_attribute("axis", model.graph))
 
 
-def of_three_dimensions(model: Any) -> None:
+def add_third_dimension(model: Any) -> None:
     weight(model).dims.append(1)
 
 
 HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
-    "loop": (loop, "has the operator Loop"),
+    "loop": (add_loop, "has the operator Loop"),
     "24 GB": (
         insert(node("ConstantOfShape", ["size"], ["much"]), size=np.array([6 * 10**9])),
         "has the operator ConstantOfShape",
@@ -119,9 +119,9 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
         insert(node("ReduceMax", ["observation"], ["a"])),
         "does not fit: ReduceMax of (N, ",
     ),
-    "external data": (external, "contains 0 of the "),
+    "external data": (store_externally, "contains 0 of the "),
     "another data type": (lambda m: setattr(weight(m), "data_type", 10), "neither a matrix"),
-    "three dimensions": (of_three_dimensions, "neither a matrix"),
+    "three dimensions": (add_third_dimension, "neither a matrix"),
     "dims unlike bytes": (lambda m: weight(m).dims.__setitem__(0, 2**40), "bytes of 'q.0.weight'"),
     "NaN weights": (
         lambda m: weight(m).CopyFrom(
@@ -137,7 +137,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
         lambda m: m.opset_import.append(onnx.helper.make_opsetid("evil", 1)),
         "operators other than those of ONNX itself",
     ),
-    "subgraph": (subgraph, "sets axis of ArgMax, which is not a number"),
+    "subgraph": (add_subgraph, "sets axis of ArgMax, which is not a number"),
     "many nodes": (
         insert(*(node("Relu", ["observation"], [f"r{i}"]) for i in range(MAX_PARTS))),
         f"more than {MAX_PARTS}",
@@ -171,13 +171,13 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_policy_is_refused(name, policy, run, tmp_path, capsys):
-    change, why = HOSTILE[name]
+def test_hostile_policy_is_rejected(name, policy, run, tmp_path, capsys):
+    change, message = HOSTILE[name]
     file = changed_policy(policy, tmp_path / "p.onnx", change)
     assert run_node([str(file), "--on", str(BAG)]) == 2
-    refused = " ".join(capsys.readouterr().err.split())
-    assert why in refused
-    assert "restock export RUN --to onnx" in refused
+    stderr = " ".join(capsys.readouterr().err.split())
+    assert message in stderr
+    assert "restock export RUN --to onnx" in stderr
     with pytest.raises(ConfigError):
         OnnxPolicy(file, TASK)
 
@@ -185,7 +185,7 @@ def test_hostile_policy_is_refused(name, policy, run, tmp_path, capsys):
 @pytest.mark.parametrize(
     "argv", [["gate", "--baseline"], ["eval", "--policies"]], ids=lambda argv: argv[0]
 )
-def test_every_verb_refuses_a_damaged_policy(argv, policy, run, tmp_path, shell):
+def test_every_command_rejects_damaged_policy(argv, policy, run, tmp_path, shell):
     damaged = bytearray(policy.read_bytes())
     damaged[len(damaged) // 2] ^= 1
     file = tmp_path / "damaged.onnx"
@@ -196,7 +196,7 @@ def test_every_verb_refuses_a_damaged_policy(argv, policy, run, tmp_path, shell)
     )
 
 
-def test_flipped_bits_are_refused(policy: Path, tmp_path: Path) -> None:
+def test_flipped_bits_are_rejected(policy: Path, tmp_path: Path) -> None:
     content, file = policy.read_bytes(), tmp_path / "p.onnx"
     rng = np.random.default_rng(0)
     for at in rng.choice(8 * len(content), 200, replace=False).tolist():
@@ -208,10 +208,10 @@ def test_flipped_bits_are_refused(policy: Path, tmp_path: Path) -> None:
                 read(file)
 
 
-def test_changed_graph_is_refused_or_a_policy(policy: Path, tmp_path: Path) -> None:
-    """Bits are flipped in the graph, and the digest fits: nothing crashes."""
+def test_changed_graph_is_rejected_or_valid(policy: Path, tmp_path: Path) -> None:
+    """Flip bits in the graph and recompute the digest: nothing crashes."""
     graph = onnx.load(policy).graph.SerializeToString()
-    rng, drives = np.random.default_rng(1), 0
+    rng, num_usable = np.random.default_rng(1), 0
     observation = np.zeros(TASK.observation_size, np.float32)
     for at in rng.choice(8 * len(graph), 200, replace=False).tolist():
         flipped = bytearray(graph)
@@ -225,13 +225,13 @@ def test_changed_graph_is_refused_or_a_policy(policy: Path, tmp_path: Path) -> N
             action = PolicyFile(file).act(observation)
         except (ConfigError, DecodeError):
             continue
-        drives += 1
+        num_usable += 1
         assert action is None or 0 <= action < len(TASK.actions)
-    assert drives  # a flipped bit of a weight makes another policy, which is one
+    assert num_usable  # a flipped bit of a weight gives another valid policy
 
 
-def test_what_is_not_checked_never_reaches_the_runtime(policy: Path, tmp_path: Path) -> None:
-    """A function of the model's own in place of Relu, and comments."""
+def test_unchecked_model_parts_do_not_reach_runtime(policy: Path, tmp_path: Path) -> None:
+    """The model defines its own Relu function and has comments."""
 
     def change(model: Any) -> None:
         opsets = [onnx.helper.make_opsetid("", 18)]
@@ -249,7 +249,7 @@ def test_what_is_not_checked_never_reaches_the_runtime(policy: Path, tmp_path: P
     assert len(set(expected)) > 1
 
 
-def test_model_of_another_make_is_evaluated_but_not_driven(policy: Path, tmp_path: Path) -> None:
+def test_foreign_model_can_be_evaluated_but_not_driven(policy: Path, tmp_path: Path) -> None:
     model = onnx.load(policy)
     del model.metadata_props[:]
     other = tmp_path / "other.onnx"

@@ -1,4 +1,4 @@
-"""Profiles: what ships, what a stranger's file may get wrong, and where each error points."""
+"""Profiles: shipped ones, invalid files, and the key that each error names."""
 
 import pickle
 
@@ -17,7 +17,7 @@ from restock.ingest.profile.profile import (
 )
 
 
-def test_the_shipped_profiles_load():
+def test_shipped_profiles_load():
     assert shipped_profiles() == ["turtlebot3", "warehouse_amr"]
     for name in shipped_profiles():
         profile = load_profile(name)
@@ -25,7 +25,7 @@ def test_the_shipped_profiles_load():
         assert {c.name for c in profile.conditions} >= {"wheel_slip", "blocked_aisle"}
 
 
-def test_the_hash_covers_a_profile_without_its_conditions():
+def test_hash_excludes_conditions():
     assert parse_profile(TEXT, where="a").hash == load_profile("warehouse_amr").hash
     changed = parse_profile(TEXT.replace("max_gap_s = 0.5", "max_gap_s = 0.6"), where="a")
     assert changed.hash != load_profile("warehouse_amr").hash
@@ -35,15 +35,15 @@ def test_the_hash_covers_a_profile_without_its_conditions():
     assert fewer.labels_version != load_profile("warehouse_amr").labels_version
 
 
-def test_the_hash_is_the_same_in_another_process():
+def test_hash_survives_pickling_and_writing():
     profile = load_profile("warehouse_amr")
     assert pickle.loads(pickle.dumps(profile)).hash == profile.hash
-    written = parse_profile(profile_toml(profile), where="written")  # has every default
+    written = parse_profile(profile_toml(profile), where="written")  # contains every default
     assert written.hash == profile.hash
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("sectors = 36", "sectrs = 36", "unknown key `task.sectrs`"),
         ("[clock]", "[klock]", "unknown key `klock`"),
@@ -64,7 +64,7 @@ def test_the_hash_is_the_same_in_another_process():
         ("[task]", "[task", "is not TOML"),
         ("max_gap_s = 0.5", "max_gap_s = nan", "clock.max_gap_s must be above 0, got nan"),
         ("max_age_s = 0.5", "max_age_s = inf", "inputs.command.max_age_s must be finite, got inf"),
-        # Keys that do not go together.
+        # Keys that exclude each other.
         ("[inputs.wheels]", "[inputs.wheels]\noptional = true", "wheels has no fallback"),
         ("[inputs.plan]", "[inputs.plon]", "unknown key `inputs.plon`"),
         ('"/cmd_vel_nav"', '"/cmd_vel"', "`inputs.nav_command.topic` is the topic of the command"),
@@ -81,30 +81,30 @@ def test_the_hash_is_the_same_in_another_process():
         ),
     ],
 )
-def test_an_error_names_the_file_and_the_key(old, new, said):
+def test_error_names_file_and_key(old, new, message):
     assert old in TEXT
     with pytest.raises(ConfigError) as error:
         parse_profile(TEXT.replace(old, new, 1), where="mine.toml")
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert str(error.value).startswith("mine.toml: ")
 
 
-def test_a_route_needs_a_goal_and_a_plan():
+def test_route_needs_goal_and_plan():
     start, end = TEXT.index("[inputs.plan]"), TEXT.index("[inputs.bumper]")
     with pytest.raises(ConfigError, match=r"`inputs\.plan` is missing"):
         parse_profile(TEXT[:start] + TEXT[end:], where="mine.toml")
 
 
-def test_a_goal_in_hindsight_needs_a_route():
+def test_hindsight_goal_needs_route():
     text = TEXT.replace('goal = "route"', 'goal = "none"') + '\n[goal]\nsource = "hindsight"\n'
     with pytest.raises(ConfigError, match=r"`task.goal` is 'none'"):
         parse_profile(text, where="mine.toml")
 
 
-def test_without_a_goal_its_topics_are_not_needed(tmp_path):
+def test_goal_topics_are_not_needed_without_goal(tmp_path):
     topics = {
-        name: one
-        for name, one in typed_topics(Drive(3.0)).items()
+        name: topic
+        for name, topic in typed_topics(Drive(3.0)).items()
         if name not in ("/goal_pose", "/plan")
     }
     bag = write_topics(topics, tmp_path / "bag")
@@ -114,7 +114,7 @@ def test_without_a_goal_its_topics_are_not_needed(tmp_path):
     assert ingest(bag, aimless, store=None).manifest["transitions"] == 14
 
 
-def test_what_stands_in_is_said():
+def test_fallbacks_of_shipped_profiles():
     assert load_profile("warehouse_amr").fallbacks == {}
     assert set(load_profile("turtlebot3").fallbacks) == {
         "bumper", "nav_command", "behaviour_policy", "true_condition", "true_exposure",
@@ -128,7 +128,7 @@ def bag(tmp_path_factory):
     return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
 
 
-def test_a_proposed_profile_reads_its_recording(bag, tmp_path, shell):
+def test_proposed_profile_reads_its_recording(bag, tmp_path, shell):
     file = tmp_path / "mine.toml"
     assert shell.out("profile", "new", bag, "--out", file) == ""
     profile = load_profile(file)
@@ -141,28 +141,28 @@ def test_a_proposed_profile_reads_its_recording(bag, tmp_path, shell):
     assert profile.task.goal == "route"
     assert profile.task.control_period_s == 0.2
     assert profile.clock.steps == "command"
-    assert (0.4, 0.0) in profile.task.actions  # what the robot was told
-    said = shell.json("profile", "check", file, bag)
-    assert said["problems"] == []
-    assert said["outcome"]["transitions"] == 29
-    assert {one["input"] for one in said["inputs"]} >= {"command", "pose", "scan", "plan"}
+    assert (0.4, 0.0) in profile.task.actions  # the commanded action
+    check = shell.json("profile", "check", file, bag)
+    assert check["problems"] == []
+    assert check["outcome"]["transitions"] == 29
+    assert {row["input"] for row in check["inputs"]} >= {"command", "pose", "scan", "plan"}
 
 
-def test_a_proposal_says_what_no_topic_fills(tmp_path, shell):
-    class Blind(Drive):
+def test_proposal_lists_missing_inputs(tmp_path, shell):
+    class IncompleteDrive(Drive):
         drop = ("/odom", "/plan", "/imu", "/amcl_pose")
 
-    bag = write_bag(Blind(), tmp_path / "bag")
-    said = shell.json("profile", "new", bag, code=3)
-    assert said["missing"] == ["pose"]
-    out = said["toml"]
+    bag = write_bag(IncompleteDrive(), tmp_path / "bag")
+    document = shell.json("profile", "new", bag, code=3)
+    assert document["missing"] == ["pose"]
+    out = document["toml"]
     assert 'source = "hindsight"' in out
     lines = out[out.index("# [inputs.pose]") : out.index("# [inputs.imu]")].splitlines()
     named = "\n".join(line[2:] for line in lines if "[inputs.wheels]" not in line)
     assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
 
 
-def test_a_profile_is_never_overwritten(bag, tmp_path):
+def test_existing_profile_is_not_overwritten(bag, tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text("mine")
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 2
@@ -173,7 +173,7 @@ OWN = '\n[[condition]]\nfile = "{}"\n'
 TIGHT = "-- There is little room.\n-- timing: pre\n-- priority: 44\nclearance_m < 0.3\n"
 
 
-def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
+def test_condition_file_beside_profile(tmp_path):
     (tmp_path / "tight.sql").write_text(TIGHT)
     file = tmp_path / "p.toml"
     file.write_text(TEXT + OWN.format("tight.sql"))
@@ -190,7 +190,7 @@ def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ('file = "../tight.sql"', "`condition[0].file` is outside the profile's folder"),
         ('file = "link.sql"', "`condition[0].file` is outside the profile's folder"),
@@ -201,7 +201,7 @@ def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
         ('file = "bare.sql"', "missing key `condition[0].timing`"),
     ],
 )
-def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
+def test_invalid_condition_file_is_rejected(entry, message, tmp_path):
     folder = tmp_path / "profiles"
     folder.mkdir()
     (tmp_path / "tight.sql").write_text(TIGHT)
@@ -213,20 +213,20 @@ def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
     file.write_text(TEXT + f"\n[[condition]]\n{entry}\n")
     with pytest.raises(ConfigError) as error:
         load_profile(file)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("sql", "said"),
+    ("sql", "message"),
     [
         ("clearance_mm < 1", 'Referenced column "clearance_mm" not found'),
         ("clearance_m", "its SQL gives FLOAT, not a boolean"),
         ("lead(bumped) OVER episode", "lead() may look at later steps"),
     ],
 )
-def test_a_condition_that_does_not_bind_is_refused_with_its_key(sql, said):
+def test_invalid_condition_sql_is_rejected_with_its_key(sql, message):
     own = f'\n[[condition]]\nname = "x"\ntiming = "pre"\nsql = """{sql}"""\n'
     with pytest.raises(ConfigError) as error:
         parse_profile(TEXT + own, where="mine.toml")
     assert str(error.value).startswith("mine.toml: `condition[0].sql` ('x'): ")
-    assert said in str(error.value)
+    assert message in str(error.value)

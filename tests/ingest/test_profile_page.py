@@ -1,4 +1,4 @@
-"""docs/profile.md: what it shows on sample_logs/ comes out, and its keys are all there are."""
+"""docs/profile.md: its console examples on sample_logs/ run as shown, and its keys are complete."""
 
 import re
 import shlex
@@ -23,7 +23,7 @@ TABLES_WITHIN = {"body", "rewards"}
 
 
 def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
-    """Run a console block: commands print the lines below; `…` stands for others."""
+    """Run a console block: commands print the lines below them; `…` matches any ending."""
     for part in block.text.removeprefix("$ ").split("\n$ "):
         command, *shown = part.splitlines()
         capsys.readouterr()
@@ -32,12 +32,15 @@ def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> 
         printed = iter(line.rstrip() for line in output.splitlines())
         for line in shown:
             start, left_out, _ = line.partition("…")
-            found = any(one.startswith(start) if left_out else one == line for one in printed)
+            found = any(
+                printed_line.startswith(start) if left_out else printed_line == line
+                for printed_line in printed
+            )
             assert found, f"{block.place}: {command}: no line {line!r} in\n{output}"
 
 
 @pytest.mark.slow  # two ingests of all sample logs
-def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys, shell):
+def test_profile_page_examples_on_sample_logs(tmp_path, monkeypatch, capsys, shell):
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     monkeypatch.chdir(tmp_path)
     ingested, audited, labelled = [block for block in BLOCKS if block.language == "console"]
@@ -60,13 +63,13 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys, shell):
     assert_prints_as_shown(labelled, capsys)
 
     audits = shell.json("audit", "store", code={0, 1, 3})["audits"]
-    assert [one["rows"] for one in audits if one["audit"] == "stale_labels"] == [0]
+    assert [audit["rows"] for audit in audits if audit["audit"] == "stale_labels"] == [0]
     again = shell.json("ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store")
-    assert {one["status"] for one in again["recordings"]} == {"unchanged"}
+    assert {recording["status"] for recording in again["recordings"]} == {"unchanged"}
 
 
-def documented() -> dict[str, dict[str, str]]:
-    """heading -> key -> its default, as the page has them."""
+def documented_defaults() -> dict[str, dict[str, str]]:
+    """Return the defaults on the page by heading and key."""
     found: dict[str, dict[str, str]] = {}
     heading = ""
     for line in PAGE.partition("## Keys of a profile")[2].splitlines():
@@ -95,14 +98,14 @@ def documented() -> dict[str, dict[str, str]]:
         (Zone, "`[frames]`, `[motion]` and `[[zone]]`", "zone."),
     ],
 )
-def test_the_page_has_every_key_and_its_default(kind, heading, prefix):
-    rows = documented()[heading]
+def test_profile_page_has_every_key_and_default(kind, heading, prefix):
+    rows = documented_defaults()[heading]
     fields = {field.encode_name: field.default for field in msgspec.structs.fields(kind)}
     keys = {key.removeprefix(prefix) for key in rows if key.startswith(prefix)}
     assert keys == fields.keys() - TABLES_WITHIN
     for key in keys:
-        said, default = rows[prefix + key], fields[key]
+        documented, default = rows[prefix + key], fields[key]
         if default in (msgspec.NODEFAULT, msgspec.UNSET, None):
-            assert said == "", key
+            assert documented == "", key
         else:
-            assert tomllib.loads(f"value = {said}")["value"] == default, key
+            assert tomllib.loads(f"value = {documented}")["value"] == default, key

@@ -1,4 +1,4 @@
-"""Readers: every container gives the same columns, and nothing goes missing unsaid."""
+"""Readers: every container gives the same columns, and every loss is reported."""
 
 import errno
 import json
@@ -29,7 +29,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 
 
-def everything(recording: Recording) -> dict[str, TopicColumns]:
+def read_all(recording: Recording) -> dict[str, TopicColumns]:
     return recording.read({topic: recording.leaves(topic) for topic in recording.topics})
 
 
@@ -62,10 +62,10 @@ CONTAINERS = {
     "mcap bag, zstd file": lambda d: compress_files(write_bag(d / "run", storage="mcap")),
     "sqlite3 bag, zstd messages": lambda d: compress_messages(write_bag(d / "run")),
     "mcap bag, zstd messages": lambda d: write_mcap(d / "r.mcap", packed=True),
-    "sqlite3 bag without metadata": lambda d: without_metadata(write_bag(d / "run")),
+    "sqlite3 bag without metadata": lambda d: remove_metadata(write_bag(d / "run")),
     "sqlite3 bag in three files": lambda d: split_sqlite(write_bag(d / "run")),
     **{
-        f"metadata version {version}": lambda d, version=version: with_metadata(
+        f"metadata version {version}": lambda d, version=version: write_metadata(
             write_bag(d / "run"), version
         )
         for version in (1, 3, 4, 5, 6, 7, 8, 9)
@@ -84,7 +84,7 @@ def compress_messages(bag: Path) -> Path:
     return bag
 
 
-def without_metadata(bag: Path) -> Path:
+def remove_metadata(bag: Path) -> Path:
     (bag / "metadata.yaml").unlink()
     file = next(bag.glob("*.db3"))
     file.rename(bag / f"{bag.name}_0.db3")
@@ -92,7 +92,7 @@ def without_metadata(bag: Path) -> Path:
 
 
 def split_sqlite(bag: Path) -> Path:
-    """Return the bag's messages in three files; the second holds the earliest."""
+    """Split the bag's messages over three files, the second of which holds the earliest."""
     file = next(bag.glob("*.db3"))
     for part in range(3):
         copy = shutil.copy(file, bag / f"run_{part}.db3")
@@ -104,14 +104,14 @@ def split_sqlite(bag: Path) -> Path:
     return bag
 
 
-def with_metadata(bag: Path, version: int) -> Path:
-    """Return the bag with a metadata.yaml as rosbag2 wrote it at that version."""
+def write_metadata(bag: Path, version: int) -> Path:
+    """Write a metadata.yaml into the bag as rosbag2 did at that version."""
     file = next(bag.glob("*.db3")).name
     qos: object = "- history: 1\n  depth: 10\n"
     about = {
         "version": version,
         "storage_identifier": "sqlite3",
-        # The first versions wrote the path from where the recorder was started.
+        # The first versions wrote the path relative to the recorder's working directory.
         "relative_file_paths": [f"run/{file}" if version < 3 else file],
         "duration": {"nanoseconds": 950_000_006},
         "starting_time": {"nanoseconds_since_epoch": START_NS + 3_000_000},
@@ -145,7 +145,7 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
         open_recording(mcap) as reference,
         open_recording(CONTAINERS[container](tmp_path)) as other,
     ):
-        expected, by_topic = everything(reference), everything(other)
+        expected, by_topic = read_all(reference), read_all(other)
         assert not other.lost_messages
         assert not [note for note in other.notes if "no metadata" not in note]
         assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
@@ -154,15 +154,19 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
             assert account.expected == account.read == account.decoded == 20, topic
 
 
-def test_the_id_is_of_the_content(bag: Path, mcap: Path, tmp_path: Path) -> None:
+def test_recording_id_depends_on_content_only(bag: Path, mcap: Path, tmp_path: Path) -> None:
     moved = shutil.copytree(bag, tmp_path / "elsewhere")
-    with open_recording(bag) as here, open_recording(moved) as there, open_recording(mcap) as other:
-        assert here.recording_id == there.recording_id
-        assert len(here.recording_id) == 16
-        assert other.recording_id != here.recording_id
+    with (
+        open_recording(bag) as original,
+        open_recording(moved) as copied,
+        open_recording(mcap) as other,
+    ):
+        assert original.recording_id == copied.recording_id
+        assert len(original.recording_id) == 16
+        assert other.recording_id != original.recording_id
 
 
-def test_finding_recordings(tmp_path: Path) -> None:
+def test_recordings_in_finds_files_and_bags(tmp_path: Path) -> None:
     (tmp_path / "many" / "a").mkdir(parents=True)
     (tmp_path / "empty").mkdir()
     write_bag(tmp_path / "many" / "a" / "run", 2)
@@ -178,8 +182,8 @@ def test_finding_recordings(tmp_path: Path) -> None:
         recordings_in(tmp_path / "empty")
 
 
-def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, shell):
-    """A folder that is somebody else's, and a link to a disk that is not mounted any more."""
+def test_unreadable_folder_is_reported_and_skipped(tmp_path, monkeypatch, shell):
+    """One folder of another user, and one link to an unmounted disk."""
     locked = tmp_path / "locked"
     locked.mkdir()
     (tmp_path / "lost+found").mkdir()
@@ -187,14 +191,15 @@ def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, shell):
     (tmp_path / "gone.mcap").symlink_to("/not/mounted/gone.mcap")
     listed = Path.iterdir
 
-    def refused(folder: Path) -> Iterator[Path]:  # root, who may run the tests, is refused nothing
+    # simulated, as root, who may run the tests, has access to everything
+    def iterdir_denied(folder: Path) -> Iterator[Path]:
         if folder.name in ("locked", "lost+found"):
             raise PermissionError(errno.EACCES, "Permission denied", str(folder))
         return listed(folder)
 
-    monkeypatch.setattr(Path, "iterdir", refused)
+    monkeypatch.setattr(Path, "iterdir", iterdir_denied)
     out, err = shell.printed("info", tmp_path, "--json", code=2)
-    shown = [Path(one["path"]).name for one in json.loads(out)["recordings"]]
+    shown = [Path(recording["path"]).name for recording in json.loads(out)["recordings"]]
     assert shown == ["good.mcap"]
     assert f"{locked}: cannot be read: Permission denied" in err
     assert "gone.mcap: a link to /not/mounted/gone.mcap, which is not there" in err
@@ -206,7 +211,7 @@ def test_an_unreadable_folder_costs_itself_alone(tmp_path, monkeypatch, shell):
 # -- bad input ------------------------------------------------------------------------------
 
 
-NO_RECORDING = [
+INVALID_FILES = [
     (b"", "an empty file"),
     (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "Git LFS pointer"),
     (b"<html>not found</html>", "not a recording"),
@@ -218,26 +223,26 @@ NO_RECORDING = [
 ]
 
 
-@pytest.mark.parametrize(("content", "says"), NO_RECORDING)
-def test_a_file_that_is_no_recording_is_refused(content: bytes | None, says: str, tmp_path: Path):
+@pytest.mark.parametrize(("content", "message"), INVALID_FILES)
+def test_invalid_file_is_rejected(content: bytes | None, message: str, tmp_path: Path):
     file = tmp_path / "run.mcap"
     if content is not None:
         file.write_bytes(content)
-    with pytest.raises(RecordingError, match=says) as caught:
+    with pytest.raises(RecordingError, match=message) as caught:
         open_recording(file)
     assert caught.value.where is not None
 
 
 @pytest.mark.parametrize("container", ["mcap, lz4", "sqlite3 bag", "mcap bag, zstd file"])
-def test_a_closed_recording_is_not_an_empty_one(container: str, tmp_path: Path) -> None:
+def test_reading_a_closed_recording_fails(container: str, tmp_path: Path) -> None:
     with open_recording(CONTAINERS[container](tmp_path)) as recording:
         assert recording.topics
-    recording.close()  # again: nothing happens
+    recording.close()  # closing again does nothing
     with pytest.raises(RecordingError, match="it is closed"):
         recording.read({"/odom": ["twist.twist.linear.x"]})
 
 
-def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
+def test_truncated_mcap_is_rejected_or_salvaged(mcap: Path, tmp_path: Path) -> None:
     whole = mcap.read_bytes()
     for share in (0.3, 0.6, 0.9):
         cut = tmp_path / "cut.mcap"
@@ -245,19 +250,19 @@ def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match="cut short"):
             open_recording(cut)
         with open_recording(cut, salvage=True) as recording, open_recording(mcap) as full:
-            by_topic = everything(recording)
-            expected = everything(full)
+            by_topic = read_all(recording)
+            expected = read_all(full)
             assert recording.integrity == "damaged"
             assert "cut short" in recording.lost_messages[0].reason
             decoded = sum(len(columns) for columns in by_topic.values())
             assert decoded > 0.6 * share * 140
-            # What came is what is in the whole file, from the start of each topic.
+            # Salvaged messages are those of the whole file, from the start of each topic.
             for topic, columns in by_topic.items():
                 times = set(expected[topic].log_time_ns.tolist())
                 assert set(columns.log_time_ns.tolist()) <= times
 
 
-def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
+def test_damaged_chunk_loses_only_its_messages(mcap: Path, tmp_path: Path) -> None:
     from restock.ingest.containers.mcap_file import McapFile
 
     chunks = McapFile(mcap)._contents.chunks
@@ -266,7 +271,7 @@ def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
     damaged[(chunks[1].start + chunks[1].stop) // 2] ^= 0xFF
     (tmp_path / "bad.mcap").write_bytes(damaged)
     with open_recording(tmp_path / "bad.mcap") as recording:
-        by_topic = everything(recording)
+        by_topic = read_all(recording)
         lost = sum(chunks[1].counts().values())
         assert sum(len(columns) for columns in by_topic.values()) == 140 - lost
         assert [loss.messages for loss in recording.lost_messages] == [lost]
@@ -274,15 +279,15 @@ def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
         assert sum(account.lost for account in recording.accounts.values()) == lost
 
 
-def test_integrity_is_what_checksums_vouch_for(mcap: Path, bag: Path, tmp_path: Path) -> None:
+def test_integrity_depends_on_checksums(mcap: Path, bag: Path, tmp_path: Path) -> None:
     unchecked = write_mcap(tmp_path / "no_crc.mcap", enable_crcs=False)
     for path, integrity in ((mcap, "verified"), (unchecked, "unverified"), (bag, "unverified")):
         with open_recording(path) as recording:
-            everything(recording)
+            read_all(recording)
             assert recording.integrity == integrity
 
 
-def test_rows_in_a_wal_file_are_seen(tmp_path: Path) -> None:
+def test_rows_in_wal_file_are_read(tmp_path: Path) -> None:
     file = next(write_bag(tmp_path / "run").glob("*.db3"))
     base = sqlite3.connect(file)
     base.execute("PRAGMA journal_mode = WAL")
@@ -302,12 +307,12 @@ def test_rows_in_a_wal_file_are_seen(tmp_path: Path) -> None:
     base.close()
     with open_recording(copy) as recording:
         assert recording.messages == 280
-        assert sum(len(columns) for columns in everything(recording).values()) == 280
+        assert sum(len(columns) for columns in read_all(recording).values()) == 280
         assert any("-wal" in note for note in recording.notes)
     assert {item.name: item.read_bytes() for item in copy.iterdir()} == kept
 
 
-def test_metadata_is_not_believed(tmp_path: Path) -> None:
+def test_wrong_metadata_is_reported(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run")
     metadata = bag / "metadata.yaml"
     text = metadata.read_text()
@@ -329,7 +334,7 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
         assert recording.topics["/odom"].expected == 20
     assert main(["info", str(bag)]) == 3
     metadata.write_text(text.replace("message_count: 20", "message_count: 19"))
-    with open_recording(bag) as recording:  # more than it counts: nothing is lost
+    with open_recording(bag) as recording:  # the file holds more than counted, so nothing is lost
         assert any("counts 19 messages on /odom" in note for note in recording.notes)
         assert not recording.lost_messages
     assert main(["info", str(bag)]) == 0
@@ -338,29 +343,29 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
         assert recording.messages == 140
 
 
-def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
+def test_messages_missing_from_statistics_count_are_lost(tmp_path: Path) -> None:
     from restock.ingest.containers.mcap_records import Op, walk
 
     file = write_mcap(tmp_path / "run.mcap")
     content = bytearray(file.read_bytes())
     for opcode, start, stop in walk(content, 8, len(content)):
-        if opcode == Op.STATISTICS:  # the last channel's count is the last field
+        if opcode == Op.STATISTICS:  # the last field is the count of the last channel
             content[stop - 8 : stop] = (25).to_bytes(8, "little")
             total = int.from_bytes(content[start : start + 8], "little")
             content[start : start + 8] = (total + 5).to_bytes(8, "little")
         if opcode == Op.FOOTER:
-            content[start + 16 : stop] = bytes(4)  # no CRC of the summary
+            content[start + 16 : stop] = bytes(4)  # removes the CRC of the summary
             break
     file.write_bytes(content)
     with open_recording(file) as recording:
-        everything(recording)
+        read_all(recording)
         lost = [account for account in recording.accounts.values() if account.lost]
         assert [account.lost for account in lost] == [5]
         assert recording.lost_messages[0].reason == "counted by the container, but missing"
 
 
-def without_summary(path: Path, *, missing: int) -> Path:
-    """Return the file without what comes after its data, and without one of its message indexes."""
+def remove_summary(path: Path, *, missing: int) -> Path:
+    """Remove the file's records after its data, and one of its message indexes."""
     from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Op, walk
 
     content = path.read_bytes()
@@ -377,15 +382,15 @@ def without_summary(path: Path, *, missing: int) -> Path:
 
 
 @pytest.mark.parametrize("missing", [1, 9, 20])
-def test_a_missing_message_index_loses_no_message(missing: int, tmp_path: Path) -> None:
-    file = without_summary(write_mcap(tmp_path / "run.mcap"), missing=missing)
+def test_missing_message_index_loses_no_message(missing: int, tmp_path: Path) -> None:
+    file = remove_summary(write_mcap(tmp_path / "run.mcap"), missing=missing)
     with open_recording(file) as recording:
         assert recording.messages == 140
-        assert sum(len(columns) for columns in everything(recording).values()) == 140
+        assert sum(len(columns) for columns in read_all(recording).values()) == 140
         assert not recording.lost_messages
 
 
-def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
+def test_topic_of_unknown_type_is_skipped_and_reported(tmp_path: Path) -> None:
     file = next(write_bag(tmp_path / "run").glob("*.db3"))
     with sqlite3.connect(file) as base:
         base.execute("UPDATE topics SET type = 'gazebo_msgs/msg/Performance' WHERE name = '/odom'")
@@ -398,7 +403,7 @@ def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
         assert [loss.topic for loss in recording.lost_messages] == ["/odom"]
 
 
-def test_implausible_log_times_are_counted_by_name(tmp_path: Path) -> None:
+def test_implausible_log_times_are_counted(tmp_path: Path) -> None:
     mcap, sqlite = tmp_path / "run.mcap", next(write_bag(tmp_path / "run", 2).glob("*.db3"))
     with mcap.open("wb") as out:
         writer = Writer(out)
@@ -428,7 +433,7 @@ def test_implausible_log_times_are_counted_by_name(tmp_path: Path) -> None:
         assert any("implausible stamps" in note for note in describe_recording(file)["notes"])
 
 
-# -- recordings that other people made ------------------------------------------------------
+# -- recordings from elsewhere --------------------------------------------------------------
 
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 
@@ -463,10 +468,10 @@ COUNTS = {
 
 @needs_shared
 @pytest.mark.parametrize("name", COUNTS)
-def test_other_peoples_recordings_are_counted_and_read(name: str) -> None:
+def test_shared_recordings_are_counted_and_read(name: str) -> None:
     with open_recording(SHARED / name) as recording:
         assert recording.messages == COUNTS[name]
-        by_topic = everything(recording)
+        by_topic = read_all(recording)
         for topic, account in recording.accounts.items():
             info = recording.topics[topic]
             assert account.expected == info.expected
@@ -478,7 +483,7 @@ def test_other_peoples_recordings_are_counted_and_read(name: str) -> None:
 
 @needs_shared
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_bag_that_is_not_cdr_is_refused_by_name(storage: str) -> None:
+def test_bag_of_unsupported_serialisation_is_rejected(storage: str) -> None:
     with pytest.raises(RecordingError, match="'wrong_format', and only CDR is supported"):
         open_recording(SHARED / "rosbag2-tests" / storage / "wrong_rmw_test")
 
@@ -491,7 +496,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_json_names_every_recording_and_topic(folder, shell):
+def test_info_json_lists_recordings_and_topics(folder, shell):
     printed = shell.out("info", folder, "--json")
     recordings = json.loads(printed)["recordings"]
     assert [entry["path"] for entry in recordings] == [
@@ -522,14 +527,14 @@ OFFERED = {
 
 
 @pytest.mark.parametrize("text", OFFERED)
-def test_offered_qos_is_named_whatever_version_wrote_it(text):
+def test_offered_qos_of_every_version_is_parsed(text):
     assert offered(text) == OFFERED[text]
 
 
-def test_it_says_that_damage_is_unseen_until_messages_are_read(folder, shell):
+def test_info_finds_damage_only_if_it_reads_messages(folder, shell):
     path = folder / "one.mcap"
     content = bytearray(path.read_bytes())
-    content[len(content) // 4] ^= 0xFF  # within the messages of a chunk
+    content[len(content) // 4] ^= 0xFF  # within a chunk's messages
     path.write_bytes(content)
     (entry,) = shell.json("info", path)["recordings"]
     assert (entry["integrity"], entry["damage"]) == (None, [])

@@ -1,4 +1,4 @@
-"""An ingest says, or refuses, a recording whose rows are in the store under another id."""
+"""Ingests detect recordings whose rows are already stored under another id."""
 
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,14 @@ from restock.ingest.store.writer import StoreWriter
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 
 
-def ingested(shell: Shell, *arguments: str | Path) -> dict[str, Any]:
-    """Return what `restock ingest … --json` says of one recording."""
-    (one,) = shell.json("ingest", *arguments, code={0, 2, 3})["recordings"]
-    return dict(one)
+def ingest_result(shell: Shell, *arguments: str | Path) -> dict[str, Any]:
+    """Return the result of `restock ingest … --json` for one recording."""
+    (result,) = shell.json("ingest", *arguments, code={0, 2, 3})["recordings"]
+    return dict(result)
 
 
-def first(tmp_path_factory: pytest.TempPathFactory, name: str, share: float) -> Path:
-    """Return the first share of a recording, as a crash would leave it."""
+def truncated_recording(tmp_path_factory: pytest.TempPathFactory, name: str, share: float) -> Path:
+    """Write the first share of a recording, as a crash would leave it."""
     path, content = tmp_path_factory.mktemp(name) / f"{name}.mcap", MONDAY.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     return path
@@ -32,34 +32,38 @@ def first(tmp_path_factory: pytest.TempPathFactory, name: str, share: float) -> 
 
 @pytest.fixture(scope="module")
 def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return first(tmp_path_factory, "part", 1 / 8)
+    return truncated_recording(tmp_path_factory, "part", 1 / 8)
 
 
 @pytest.fixture(scope="module")
 def third(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the whole that the part is of."""
-    return first(tmp_path_factory, "third", 1 / 3)
+    """Return the recording that contains the part."""
+    return truncated_recording(tmp_path_factory, "third", 1 / 3)
 
 
-def test_sketches_that_share_hashes_are_found_together():
+def test_sketches_with_common_hashes_are_found():
     rng = np.random.default_rng(0)
     mine = np.unique(rng.integers(2**63, size=900, dtype=np.uint64))
     parts = [mine[n : n + 40] for n in range(0, 400, 40)]
-    strange = rng.integers(2**63, size=(3, 40), dtype=np.uint64)
-    mixed = [np.concatenate([part[:n], other]) for n, other in enumerate(strange) for part in parts]
-    sketches = [Sketch("", "", np.sort(one)) for one in [*parts, *mixed, *strange, mine[:0]]]
+    unrelated = rng.integers(2**63, size=(3, 40), dtype=np.uint64)
+    mixed = [
+        np.concatenate([part[:n], other]) for n, other in enumerate(unrelated) for part in parts
+    ]
+    sketches = [
+        Sketch("", "", np.sort(sketch)) for sketch in [*parts, *mixed, *unrelated, mine[:0]]
+    ]
     found = sharing(mine, sketches)
     assert found == sketches[: len(parts)]
-    assert [one for one in found if looks_alike(mine, one)] == found
-    assert not any(looks_alike(mine, one) for one in sketches[len(parts) :])
+    assert [sketch for sketch in found if looks_alike(mine, sketch)] == found
+    assert not any(looks_alike(mine, sketch) for sketch in sketches[len(parts) :])
     assert sharing(mine, []) == sharing(mine[:0], sketches) == []
 
 
-def test_the_whole_after_a_part_is_said(part, third, tmp_path, shell):
+def test_longer_recording_after_its_part_is_reported(part, third, tmp_path, shell):
     store = tmp_path / "store"
-    first = ingested(shell, part, "--salvage", "--store", store)
+    first = ingest_result(shell, part, "--salvage", "--store", store)
     assert first["repeats"] is None
-    whole = ingested(shell, third, "--salvage", "--store", store)
+    whole = ingest_result(shell, third, "--salvage", "--store", store)
     assert whole["status"] == "written"
     assert whole["repeats"] == {
         "recording_id": first["recording_id"],
@@ -74,31 +78,31 @@ def test_the_whole_after_a_part_is_said(part, third, tmp_path, shell):
     assert f"`restock store remove {store} {first['recording_id']}` removes that one" in note
 
 
-def test_the_whole_takes_the_place_of_a_part_where_asked(part, third, tmp_path, shell):
-    """As of a bag that was still being written the night before. The part does not come back."""
+def test_longer_recording_replaces_its_part_on_request(part, third, tmp_path, shell):
+    """The part may be a bag that was still being written; ingesting it again fails."""
     store, replace = tmp_path / "store", ("--repeated", "replace")
-    first = ingested(shell, part, "--salvage", "--store", store, *replace)
-    whole = ingested(shell, third, "--salvage", "--store", store, *replace)
+    first = ingest_result(shell, part, "--salvage", "--store", store, *replace)
+    whole = ingest_result(shell, third, "--salvage", "--store", store, *replace)
     (note,) = (note for note in whole["notes"] if "which was removed" in note)
     assert note.startswith(f"in place of {part} (recording {first['recording_id']}), a part of it")
     assert [row["recording_id"] for row in StoreWriter(store).live().to_pylist()] == [
         whole["recording_id"]
     ]
-    again = ingested(shell, part, "--salvage", "--store", store, *replace)
+    again = ingest_result(shell, part, "--salvage", "--store", store, *replace)
     assert again["status"] == "failed"
     assert whole["recording_id"] in again["error"]
 
 
-def test_what_people_corrected_stays(part, third, tmp_path, shell):
+def test_corrected_recording_is_not_replaced(part, third, tmp_path, shell):
     store = tmp_path / "store"
-    first = ingested(shell, part, "--salvage", "--store", store)
+    first = ingest_result(shell, part, "--salvage", "--store", store)
     review = tmp_path / "review.csv"
     review.write_text(
         "episode_id,condition,first_step,last_step,verdict\n"
         f"{first['recording_id']}/0,near_collision,0,3,yes\n"
     )
     assert main(["review", str(store), str(review)]) == 0
-    whole = ingested(shell, third, "--salvage", "--store", store, "--repeated", "replace")
+    whole = ingest_result(shell, third, "--salvage", "--store", store, "--repeated", "replace")
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note
     assert f"`restock store remove {store} {first['recording_id']}`" in note
@@ -116,7 +120,7 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
         assert store.repeated(staged, 0.2) is None
 
 
-def test_hashes_see_a_thousandth_and_no_less() -> None:
+def test_row_hashes_resolve_one_thousandth() -> None:
     rows = recording_transitions(1)
     place = rows.schema.get_field_index("observation")
 

@@ -1,4 +1,4 @@
-"""The robot of a description: what is taken from it, and what is said of the rest."""
+"""The robot of a URDF description: values taken from it, and notes on the rest."""
 
 from pathlib import Path
 
@@ -51,15 +51,15 @@ def wheels(*places: tuple[float, float], radius: str = WHEEL, **how: str) -> str
     )
 
 
-def of(text: str) -> DescribedRobot:
+def described(text: str) -> DescribedRobot:
     description = read_description(text)
     assert isinstance(description, Description), description
     return described_robot(description, 0.0, "laser")
 
 
-def test_one_axle_and_a_lidar() -> None:
+def test_one_axle_and_lidar() -> None:
     laser = link("laser") + joint("laser", "0.3 0 0.2", kind="fixed")
-    found = of(robot(wheels((0.2, 0.22), (0.2, -0.22)), laser))
+    found = described(robot(wheels((0.2, 0.22), (0.2, -0.22)), laser))
     assert found.values == {
         "drive": "differential",
         "wheel_radius_m": 0.1,
@@ -71,24 +71,27 @@ def test_one_axle_and_a_lidar() -> None:
     }
 
 
-def test_two_axles_are_skid_steer_unless_something_steers() -> None:
+def test_two_axles_are_skid_steer_without_steering_joint() -> None:
     places = ((0.25, 0.2), (0.25, -0.2), (-0.25, 0.2), (-0.25, -0.2))
-    values = of(robot(wheels(*places))).values
+    values = described(robot(wheels(*places))).values
     assert (values["drive"], values["wheelbase_m"]) == ("skid_steer", 0.5)
     mecanum = robot(wheels(*places)).replace("wheel_", "mecanum_")
-    assert of(mecanum).values["drive"] == "omnidirectional"
+    assert described(mecanum).values["drive"] == "omnidirectional"
     steering = "".join(
         link(f"hub_{i}") + joint(f"hub_{i}", f"0.25 {y} -0.05", "0 0 1", "revolute")
         + link(f"front_{i}", WHEEL) + joint(f"front_{i}", "0 0 0", parent=f"hub_{i}")
         for i, y in enumerate((0.2, -0.2))
     )  # fmt: skip
-    assert of(robot(wheels((-0.25, 0.2), (-0.25, -0.2)), steering)).values["drive"] == "ackermann"
+    assert (
+        described(robot(wheels((-0.25, 0.2), (-0.25, -0.2)), steering)).values["drive"]
+        == "ackermann"
+    )
 
 
-def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
+def test_radius_of_mesh_wheel_follows_floor() -> None:
     mesh = "<mesh filename='package://none/wheel.stl'/>"
     footprint = link("base_footprint") + joint("base_footprint", "0 0 -0.12", kind="fixed")
-    found = of(robot(wheels((0, 0.2), (0, -0.2), radius=mesh), footprint))
+    found = described(robot(wheels((0, 0.2), (0, -0.2), radius=mesh), footprint))
     assert found.values["wheel_radius_m"] == pytest.approx(0.07)
     assert "only meshes" in found.notes[-1]
 
@@ -100,8 +103,8 @@ def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
         (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on both sides"),
     ],
 )
-def test_what_does_not_roll_is_named(text: str, message: str) -> None:
-    found = of(text)
+def test_robot_without_driven_wheels_is_reported(text: str, message: str) -> None:
+    found = described(text)
     assert not found.values
     assert message in (found.problem or "")
 
@@ -109,7 +112,7 @@ def test_what_does_not_roll_is_named(text: str, message: str) -> None:
 DRIVEN = robot(wheels((0, 0.2), (0, -0.2)))
 ENTITIES = "<!DOCTYPE r [<!ENTITY a 'ha'><!ENTITY b '&a;&a;'>]><robot>&b;</robot>"
 LOOP = joint("b", "0 0 0", parent="a") + joint("a", "0 0 0", parent="b")
-REFUSED = {
+INVALID_DESCRIPTIONS = {
     "<robot": "is not XML",
     ENTITIES: "must not declare entities",
     DRIVEN.replace("0.8 0.5", "${length} 0.5"): "xacro file",
@@ -122,27 +125,27 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("text", REFUSED)
-def test_a_hostile_description_is_refused(text: str) -> None:
+@pytest.mark.parametrize("text", INVALID_DESCRIPTIONS)
+def test_invalid_description_is_rejected(text: str) -> None:
     found = read_description(text)
     assert isinstance(found, str)
-    assert REFUSED[text] in found
+    assert INVALID_DESCRIPTIONS[text] in found
 
 
-def test_a_urdf_written_by_xacro_is_used() -> None:
+def test_urdf_generated_by_xacro_is_accepted() -> None:
     text = XACRO.format(BASE + wheels((0, 0.2), (0, -0.2)))
-    assert of(text).values["track_m"] == 0.4
+    assert described(text).values["track_m"] == 0.4
 
 
 @pytest.mark.parametrize("base", ["chassis", "robot1_base_link"])
-def test_a_base_of_another_name_is_the_link_that_no_joint_places(base: str) -> None:
+def test_root_link_of_another_name_is_the_base(base: str) -> None:
     laser = link("laser") + joint("laser", "0.3 0 0.2", kind="fixed")
     usual = robot(wheels((0.2, 0.22), (0.2, -0.22)), laser)
-    found = of(usual.replace("base_link", base))
-    assert found.values == of(usual).values
+    found = described(usual.replace("base_link", base))
+    assert found.values == described(usual).values
     assert found.notes[0].startswith(f"{base!r} is taken for the base")
     under = link("foot") + joint(base, "0 0 0.15", kind="fixed", parent="foot")
-    above = of(usual.replace("base_link", base).replace("</robot>", under + "</robot>"))
+    above = described(usual.replace("base_link", base).replace("</robot>", under + "</robot>"))
     assert above.values == found.values
     assert "'foot' is taken for the base" in above.notes[0]
 
@@ -159,16 +162,16 @@ def test_a_base_of_another_name_is_the_link_that_no_joint_places(base: str) -> N
         max_size=6,
     )
 )
-def test_any_tree_of_joints_ends_in_values_or_a_sentence(parts):
-    """Loops, orphans, numbers that are none: nothing raises, and what is taken is finite."""
+def test_any_joint_tree_gives_finite_values_or_a_problem(parts):
+    """Loops, orphans and invalid numbers raise nothing, and all values are finite."""
     body = "".join(
         link(f"l{i}", shape) + joint(f"l{i}", xyz, axis, kind, parent)
         for i, (kind, parent, xyz, axis, shape) in enumerate(parts)
     )
-    found = of(robot(body))
+    found = described(robot(body))
     assert (found.problem is None) == bool(found.values)
     for value in found.values.values():
-        assert value == value  # no NaN
+        assert value == value  # not NaN
         assert value != float("inf")
 
 
@@ -177,7 +180,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_topics(typed_topics(Drive()), tmp_path_factory.mktemp("drive") / "bag")
 
 
-def test_a_proposed_profile_has_the_robot_of_the_file(bag, tmp_path):
+def test_proposal_takes_robot_from_urdf_file(bag, tmp_path):
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(robot(wheels((0.2, 0.22), (0.2, -0.22))))
     with open_recording(bag) as recording:
@@ -194,11 +197,11 @@ def test_a_proposed_profile_has_the_robot_of_the_file(bag, tmp_path):
     assert by_logs.lidar.beams == own.robot.lidar.beams
 
 
-def test_an_arms_description_does_not_hide_its_bases(tmp_path: Path) -> None:
+def test_description_of_arm_does_not_hide_that_of_base(tmp_path: Path) -> None:
     texts = {"/arm": robot(), "/base": robot(wheels((0.2, 0.22), (0.2, -0.22)))}
     topics = typed_topics(Drive())
     for place, text in texts.items():
-        topics[f"{place}/robot_description"] = said(text)
+        topics[f"{place}/robot_description"] = description_topic(text)
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
         proposed = propose_profile(recording, "mine")
     own = parse_profile(proposed.toml, where="proposed").robot
@@ -209,15 +212,15 @@ def test_an_arms_description_does_not_hide_its_bases(tmp_path: Path) -> None:
 SMALL = robot(wheels((0.2, 0.22), (0.2, -0.22)))
 
 
-def said(text: str) -> tuple[str, TopicColumns]:
+def description_topic(text: str) -> tuple[str, TopicColumns]:
     data = {"data": np.array([text], object)}
     return "std_msgs/msg/String", columns(np.array([0.01]), data, stamped=False)
 
 
 @pytest.mark.parametrize(
-    ("said_of", "outline", "source"),
+    ("descriptions_", "outline", "source"),
     [
-        # Its own description, not the one that comes first.
+        # Its own description, although another comes first.
         (
             {
                 "/robot1": robot(wheels((0.3, 0.32), (0.3, -0.32))),
@@ -226,17 +229,19 @@ def said(text: str) -> tuple[str, TopicColumns]:
             },
             *((0.6, 0.64), "/robot2/robot_description"),
         ),
-        # One of no robot in particular, if it has none of its own.
+        # A description without a namespace, if the robot has none of its own.
         ({"": SMALL}, (0.8, 0.64), "/robot_description; /robot2 has none of its own"),
         ({"/robot1": SMALL}, None, None),
     ],
 )
-def test_robots_in_a_recording_have_their_own_outlines(said_of, outline, source, tmp_path):
+def test_each_robot_gets_its_own_outline(descriptions_, outline, source, tmp_path):
     short, whole = typed_topics(Drive(duration_s=1.0)), typed_topics(Drive(duration_s=2.0))
     used = ("/cmd_vel", "/amcl_pose", "/odom")
     topics = {f"/robot1{name}": short[name] for name in used}
     topics |= {f"/robot2{name}": whole[name] for name in used}
-    topics |= {f"{name}/robot_description": said(text) for name, text in said_of.items()}
+    topics |= {
+        f"{name}/robot_description": description_topic(text) for name, text in descriptions_.items()
+    }
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
         assert robots_in(recording) == ["/robot2", "/robot1"]
         found, notes = footprint_of(descriptions(recording))

@@ -62,8 +62,8 @@ def graph() -> Iterator[RosGraph]:
     made.close()
 
 
-def by_hand(graph: Graph, step: int, hand: range) -> None:
-    """Press the button in these steps, and drive to and fro."""
+def drive_by_hand(graph: Graph, step: int, hand: range) -> None:
+    """Press the button and drive to and fro during the steps of `hand`."""
     pressed = message_class(BOOL)()
     pressed.data = step in hand
     graph.send(live.TAKEOVER, pressed)
@@ -74,18 +74,18 @@ def by_hand(graph: Graph, step: int, hand: range) -> None:
 
 
 def episode(graph: RosGraph, hand: range = range(0)) -> Iterator[TwinRobot]:
-    """Drive an episode by the node of another process; yield the robot at each control period."""
+    """Drive an episode with the node of another process; yield the robot at each control period."""
     robot = TwinRobot(graph, SPEC)
     now_ns = int(robot.env.signals["stamp_ns"][0])
     graph.until(graph.matched)
-    # A timer by the clock fires when there is one: it has nothing to decide by.
+    # A timer fires once its clock exists, at first without any input.
     with graph.more(live.LIMITER, COMMAND, meanwhile=partial(graph.clock, now_ns - PERIOD_NS)):
         pass
     for step in range(240):
         with graph.more(live.LIMITER, COMMAND, meanwhile=partial(graph.clock, now_ns)):
             graph.clock(now_ns - BEFORE_NS)
             robot.sense()
-            by_hand(graph, step, hand)
+            drive_by_hand(graph, step, hand)
             graph.settled()
         ended = robot.drive()
         now_ns += PERIOD_NS
@@ -94,7 +94,7 @@ def episode(graph: RosGraph, hand: range = range(0)) -> Iterator[TwinRobot]:
             return
 
 
-def test_it_drives_the_twin_to_its_goal_but_for_a_takeover(policy, graph, tmp_path):
+def test_node_drives_twin_to_goal_with_takeover(policy, graph, tmp_path):
     with node_process(tmp_path / "log", str(policy), *DRIVES):
         *_, robot = drives = list(episode(graph, hand := range(20, 30)))
     assert bool(robot.info["success"][0])
@@ -118,11 +118,11 @@ def test_it_drives_the_twin_to_its_goal_but_for_a_takeover(policy, graph, tmp_pa
         ((), signal.SIGINT),
         ((), signal.SIGTERM),
         (("configure",), signal.SIGTERM),
-        (("configure", "activate"), signal.SIGINT),  # in shadow
+        (("configure", "activate"), signal.SIGINT),  # in shadow mode
         (("configure", "shutdown"), signal.SIGINT),
     ],
 )
-def test_a_signal_ends_it_in_every_state(policy, graph, tmp_path, to, number):
+def test_signal_ends_node_in_every_state(policy, graph, tmp_path, to, number):
     log = tmp_path / "log"
     with node_process(log, str(policy)) as process:
         graph.until(lambda: "waits for" in log.read_text(encoding="utf-8"))
@@ -134,7 +134,7 @@ def test_a_signal_ends_it_in_every_state(policy, graph, tmp_path, to, number):
     assert not graph.of(COMMAND)
 
 
-def test_a_signal_while_it_drives_ends_with_a_stop(policy, graph, tmp_path):
+def test_signal_while_driving_sends_stop(policy, graph, tmp_path):
     with node_process(tmp_path / "log", str(policy), *DRIVES) as process:
         for _ in episode(graph):
             if graph.of(COMMAND)[-1].linear.x > 0:
@@ -146,7 +146,7 @@ def test_a_signal_while_it_drives_ends_with_a_stop(policy, graph, tmp_path):
     assert graph.of(WHO)[-1].data == PROFILE.behaviour_policy
 
 
-def test_the_stub_and_rclpy_give_the_same_commands(policy: Path, graph: RosGraph) -> None:
+def test_stub_and_rclpy_give_the_same_commands(policy: Path, graph: RosGraph) -> None:
     from rclpy.parameter import Parameter
 
     robot, hand, steps = TwinRobot(graph, SPEC), range(10, 15), 30
@@ -173,23 +173,25 @@ def test_the_stub_and_rclpy_give_the_same_commands(policy: Path, graph: RosGraph
     node.policy.pilot.receive = count
     graph.until(graph.matched)
     graph.until(
-        lambda: all(each.get_subscription_count() for each in node.policy._published.values())
+        lambda: all(
+            publisher.get_subscription_count() for publisher in node.policy._published.values()
+        )
     )
     messages: list[list[tuple[str, Any]]] = []
     send = graph.send
 
-    def keep(topic: str, message: Any, *offered: Any) -> None:
+    def send_and_keep(topic: str, message: Any, *offered: Any) -> None:
         messages[-1].append((topic, message))
         send(topic, message, *offered)
 
-    graph.send = keep  # type: ignore[method-assign]
+    graph.send = send_and_keep  # type: ignore[method-assign]
     for step in range(steps):
         now_ns = int(robot.env.signals["stamp_ns"][0])
         clock(now_ns - BEFORE_NS)
         messages.append([])
         before = heard.copy()
         robot.sense()
-        by_hand(graph, step, hand)
+        drive_by_hand(graph, step, hand)
         for topic, _ in messages[-1]:
             graph.until(lambda topic=topic, before=before: heard[topic] > before[topic])
         clock(now_ns)
@@ -209,7 +211,9 @@ def test_the_stub_and_rclpy_give_the_same_commands(policy: Path, graph: RosGraph
         stub.now_ns += BEFORE_NS
         stub.fire()
     for topic in HEARS:
-        ours, theirs = ([serialise(one) for one in each.of(topic)] for each in (stub, graph))
+        ours, theirs = (
+            [serialise(message) for message in each.of(topic)] for each in (stub, graph)
+        )
         assert ours == theirs, topic
     node.trigger_shutdown()
     node.destroy_node()

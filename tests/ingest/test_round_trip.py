@@ -73,7 +73,7 @@ ROUGH = Schedule(
         localisation_period_s=0.4,
     ),
 )
-SINGLE = 2e-6  # what single precision leaves of poses on this floor
+SINGLE = 2e-6  # error of poses on this floor in single precision
 SCALARS = {
     "gyro_yaw_rate": GYRO_LSB_RADPS / 2,
     "slip_yaw_rate": GYRO_LSB_RADPS / 2,
@@ -85,8 +85,8 @@ SCALARS = {
 
 
 @dataclass(frozen=True)
-class Case:
-    """One way to record."""
+class RecordingCase:
+    """One way to record: hardware, format and driver."""
 
     hardware: Perturbation | Schedule
     format: Format = "mcap"
@@ -95,18 +95,18 @@ class Case:
 
 
 CASES = {
-    "noiseless mcap": Case(NOISELESS),
-    "stand-in rosbag2": Case(HARDWARE, "rosbag2"),
-    "a run, perturbed, mcap": Case(ROUGH, "mcap", "run:", 0.25),
-    "a run, stand-in, rosbag2": Case(HARDWARE, "rosbag2", "run:", 0.0),
+    "noiseless mcap": RecordingCase(NOISELESS),
+    "stand-in rosbag2": RecordingCase(HARDWARE, "rosbag2"),
+    "a run, perturbed, mcap": RecordingCase(ROUGH, "mcap", "run:", 0.25),
+    "a run, stand-in, rosbag2": RecordingCase(HARDWARE, "rosbag2", "run:", 0.0),
 }
 
 
 @dataclass
-class Trip:
-    """A recording's way: driven, written, ingested."""
+class RoundTrip:
+    """Recording that was driven, written and ingested."""
 
-    case: Case
+    case: RecordingCase
     folder: Path
     plan: RecordingPlan = field(init=False)
     driven: list[DrivenMission] = field(init=False)
@@ -128,7 +128,7 @@ class Trip:
         self.path = self.folder / ("log.mcap" if case.format == "mcap" else "log")
         loaded = load_policy(policy)
         self.summary = record(self.path, self.plan, policy=loaded)
-        # The same missions once more: the twin is deterministic, and nothing of it is on disk.
+        # Drive the same missions again: the twin is deterministic, and its states are not on disk.
         fleet = Fleet(case.hardware, stops=case.policy != HANDOVER, scan_hz=self.plan.rates.scan)
         external = loaded and ExternalPolicy(loaded, epsilon=case.epsilon or 0.0, seed=7)
         drivers = BehaviourPolicies(
@@ -141,13 +141,13 @@ class Trip:
         query = "FROM transitions ORDER BY episode_index, step_index"
         self.rows = Store(store).sql(query).to_arrow_table()
 
-    def saw(self, of: str, last: int | None = None, first: int = 0) -> NDArray[Any]:
-        return np.concatenate([np.asarray(getattr(d, of))[first:last] for d in self.driven])
+    def twin_values(self, attribute: str, last: int | None = None, first: int = 0) -> NDArray[Any]:
+        return np.concatenate([np.asarray(getattr(d, attribute))[first:last] for d in self.driven])
 
-    def signal(self, name: str) -> NDArray[Any]:
+    def twin_signal(self, name: str) -> NDArray[Any]:
         return np.concatenate([d.drive.signals[name][1:] for d in self.driven])
 
-    def row(self, name: str) -> NDArray[Any]:
+    def row_values(self, name: str) -> NDArray[Any]:
         column = self.rows[name].to_numpy()
         return np.stack(column) if column.dtype == object and len(column) else column
 
@@ -163,19 +163,22 @@ def _missions(plan: RecordingPlan, policy: Any) -> Any:
     return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
 
 
-SHORT = ("stand-in rosbag2", "a run, perturbed, mcap")  # these two alone have all that differs
+FAST_CASES = (
+    "stand-in rosbag2",
+    "a run, perturbed, mcap",
+)  # together these two cover all differences
 PARAMS = [
-    pytest.param(case, id=name, marks=() if name in SHORT else pytest.mark.long)
+    pytest.param(case, id=name, marks=() if name in FAST_CASES else pytest.mark.long)
     for name, case in CASES.items()
 ]
 
 
 @pytest.fixture(scope="module", params=PARAMS)
-def trip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Trip:
-    return Trip(request.param, tmp_path_factory.mktemp("trip"))
+def trip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RoundTrip:
+    return RoundTrip(request.param, tmp_path_factory.mktemp("trip"))
 
 
-def test_every_step_is_there_in_its_episode_and_no_other(trip: Trip) -> None:
+def test_every_step_is_in_its_episode(trip: RoundTrip) -> None:
     assert trip.outcome.lost_messages == []
     assert trip.rows.num_rows == sum(trip.steps)
     episode = [index for index, steps in enumerate(trip.steps) for _ in range(steps)]
@@ -185,7 +188,7 @@ def test_every_step_is_there_in_its_episode_and_no_other(trip: Trip) -> None:
     assert set(trip.summary.missions) == set(EQUAL)
 
 
-def test_episodes_end_as_they_did(trip: Trip) -> None:
+def test_episode_endings_match(trip: RoundTrip) -> None:
     last = np.cumsum(trip.steps) - 1
     reached = last[[driven.terminated for driven in trip.driven]]
     assert np.flatnonzero(trip.row("terminated")).tolist() == reached.tolist()
@@ -193,7 +196,7 @@ def test_episodes_end_as_they_did(trip: Trip) -> None:
     assert np.flatnonzero(trip.row("truncated")).tolist() == cut.tolist()
 
 
-def test_observations_are_what_the_twin_saw(trip: Trip) -> None:
+def test_observations_match_twin(trip: RoundTrip) -> None:
     names = TASK.observation_names
     place = {name: index for index, name in enumerate(names)}
     near = [place[name] for name in names if name.startswith("clearance_")]
@@ -207,39 +210,39 @@ def test_observations_are_what_the_twin_saw(trip: Trip) -> None:
         for name in others:
             error = np.abs(stored[:, place[name]] - seen[:, place[name]])
             assert error.max() <= SCALARS.get(name, SINGLE) + SINGLE, (column, name)
-        # The entries are roots of metres within the range that counts.
+        # The entries are square roots of the share of the maximum range.
         metres = np.abs(stored[:, near] ** 2 - seen[:, near] ** 2) * TASK.range_max_m
         off = metres > LIDAR_LSB_M / 2 + 1e-5
         assert (np.maximum(stored[:, near], seen[:, near])[off] == 1.0).all(), column
         assert off.mean() < 1e-3, column
-    now, after = trip.row("observation"), trip.row("next_observation")
-    change = after[:, near] - now[:, near]
+    before, after = trip.row("observation"), trip.row("next_observation")
+    change = after[:, near] - before[:, near]
     np.testing.assert_allclose(after[:, closing], change, atol=1e-6)
     first = trip.row("step_index") == 0
-    assert not now[first][:, closing].any()
+    assert not before[first][:, closing].any()
 
 
-def test_what_navigation_proposed_is_what_the_twin_saw(trip: Trip) -> None:
-    kept = ("nav_speed_mps", "nav_yaw_rate_radps")
-    seen = [np.concatenate([d.drive.signals[name][:-1] for d in trip.driven]) for name in kept]
-    for name, values in zip(kept, seen, strict=True):
+def test_navigation_commands_match_twin(trip: RoundTrip) -> None:
+    names = ("nav_speed_mps", "nav_yaw_rate_radps")
+    seen = [np.concatenate([d.drive.signals[name][:-1] for d in trip.driven]) for name in names]
+    for name, values in zip(names, seen, strict=True):
         np.testing.assert_array_equal(trip.row(name), values.astype(np.float32))
-    # Whoever drives: the planner does as it proposes unless it explores, others as they like.
+    # The planner drives as it proposes unless it explores; other drivers need not.
     given = np.concatenate([d.drive.command for d in trip.driven])
     same = (np.stack(seen, axis=-1) == given).all(axis=1)
-    who = [entry for driven in trip.driven for entry in driven.drive.policy]
-    planned = np.array([entry[:2] == ("planner", "1") and entry[2] > 0.5 for entry in who])
+    drivers = [entry for driven in trip.driven for entry in driven.drive.policy]
+    planned = np.array([entry[:2] == ("planner", "1") and entry[2] > 0.5 for entry in drivers])
     assert same[planned].all()
     assert same[~planned].mean() < 0.9
 
 
-def test_a_next_observation_is_the_observation_of_the_next_row(trip: Trip) -> None:
+def test_next_observation_equals_observation_of_next_row(trip: RoundTrip) -> None:
     same = np.diff(trip.row("episode_index")) == 0
-    now, after = trip.row("observation"), trip.row("next_observation")
-    np.testing.assert_array_equal(after[:-1][same], now[1:][same])
+    before, after = trip.row("observation"), trip.row("next_observation")
+    np.testing.assert_array_equal(after[:-1][same], before[1:][same])
 
 
-def test_actions_and_rewards_are_what_the_twin_gave(trip: Trip) -> None:
+def test_actions_and_rewards_match_twin(trip: RoundTrip) -> None:
     assert trip.row("action").tolist() == trip.saw("action").tolist()
     clearance = trip.signal("clearance_m")
     on_edge = np.abs(clearance - TASK.rewards.tight_clearance_m) < LIDAR_LSB_M
@@ -249,12 +252,12 @@ def test_actions_and_rewards_are_what_the_twin_gave(trip: Trip) -> None:
     assert on_edge.mean() < 0.05
 
 
-def test_who_drove_and_what_was_true_come_through(trip: Trip) -> None:
+def test_drivers_conditions_and_perturbations_match_twin(trip: RoundTrip) -> None:
     drives = [driven.drive for driven in trip.driven]
-    who = [entry for drive in drives for entry in drive.policy]
-    assert trip.rows["behaviour_policy"].to_pylist() == [name for name, _, _ in who]
-    assert trip.rows["behaviour_version"].to_pylist() == [version for _, version, _ in who]
-    assert trip.row("action_probability") == pytest.approx([p for _, _, p in who], abs=1e-4)
+    drivers = [entry for drive in drives for entry in drive.policy]
+    assert trip.rows["behaviour_policy"].to_pylist() == [name for name, _, _ in drivers]
+    assert trip.rows["behaviour_version"].to_pylist() == [version for _, version, _ in drivers]
+    assert trip.row("action_probability") == pytest.approx([p for _, _, p in drivers], abs=1e-4)
     truth = [name for drive in drives for name in drive.true_condition]
     assert trip.rows["true_condition"].to_pylist() == truth
     assert len(set(truth)) > 2
@@ -266,12 +269,12 @@ def test_who_drove_and_what_was_true_come_through(trip: Trip) -> None:
     for first, item in zip(firsts.tolist(), parameters, strict=True):
         assert dict(trip.rows["perturbation_values"][first].as_py()) == item.changed()
     if trip.case.policy == HANDOVER:
-        assert len({name for name, _, _ in who}) > 1  # the operator took over somewhere
+        assert len({name for name, _, _ in drivers}) > 1  # the operator took over in some episode
     else:
-        assert {(name, version) for name, version, _ in who} == {("dqn", "learner@7")}
+        assert {(name, version) for name, version, _ in drivers} == {("dqn", "learner@7")}
         greedy = 1 - trip.plan.epsilon + trip.plan.epsilon / len(TASK.actions)
         chances = {greedy, trip.plan.epsilon / len(TASK.actions)} - {0.0}
-        assert {round(p, 5) for _, _, p in who} == {round(p, 5) for p in chances}
+        assert {round(p, 5) for _, _, p in drivers} == {round(p, 5) for p in chances}
 
 
 def _parameters(mission: Mission) -> Perturbation:

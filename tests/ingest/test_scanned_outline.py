@@ -1,4 +1,4 @@
-"""The outline by what the lidar never saw inside, its own parts, and where transforms put it."""
+"""Outlines derived from scans: free space, the robot's own parts, and the lidar's transform."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +27,13 @@ KEPT = ("/cmd_vel", "/amcl_pose", "/odom", "/scan")
 
 
 @dataclass
-class Turning(Drive):
-    """Drives on while it turns; a wall stands at `nearest_m` on one side of the room."""
+class TurningDrive(Drive):
+    """Drive that turns as it moves, with a wall at `nearest_m` on one side of the room."""
 
     nearest_m: float = 0.25
     near_scans: int = 8
-    post_m: float | None = None  # of itself, straight behind: what its lidar always sees
+    # distance of the robot's own post, straight behind, which the lidar always sees
+    post_m: float | None = None
 
     def topics(self) -> dict[str, TopicColumns]:
         found = {name: c for name, c in super().topics().items() if name in KEPT}
@@ -54,31 +55,35 @@ class Turning(Drive):
         return found
 
 
-def proposed(topics: dict[str, TopicColumns], folder: Path, *options: str) -> tuple[Profile, str]:
-    """Return the profile that is proposed for these topics, and its text."""
+def propose(topics: dict[str, TopicColumns], folder: Path, *options: str) -> tuple[Profile, str]:
+    """Return the profile proposed for these topics, and its text."""
     bag = write_topics(typed_columns(topics), folder / "bag", storage="mcap")
     profile = ingested.proposed(bag, folder / "p.toml", *options, codes=(0, 3))
     return profile, (folder / "p.toml").read_text()
 
 
 @pytest.mark.parametrize(
-    ("drive", "length_m", "said"),
+    ("drive", "length_m", "text_part"),
     [
-        (Turning(12.0), 0.3125, "which saw nothing nearer than 0.25 m: MEASURE IT"),
-        (Turning(12.0, nearest_m=0.9), 0.6, "A GUESS, as the recording does not contain it"),
-        (Turning(12.0, near_scans=1), 0.6, ""),  # one odd return makes no robot smaller
-        (Turning(12.0, nearest_m=0.06), 0.1, ""),  # than robots are
+        (TurningDrive(12.0), 0.3125, "which saw nothing nearer than 0.25 m: MEASURE IT"),
+        (TurningDrive(12.0, nearest_m=0.9), 0.6, "A GUESS, as the recording does not contain it"),
+        (
+            TurningDrive(12.0, near_scans=1),
+            0.6,
+            "",
+        ),  # a single odd return does not shrink the outline
+        (TurningDrive(12.0, nearest_m=0.06), 0.1, ""),  # smaller than any robot
     ],
 )
-def test_no_outline_reaches_to_what_the_lidar_saw(drive, length_m, said, tmp_path):
-    profile, text = proposed(drive.topics(), tmp_path)
+def test_guessed_outline_is_within_free_space(drive, length_m, text_part, tmp_path):
+    profile, text = propose(drive.topics(), tmp_path)
     assert profile.task.body.length_m == pytest.approx(length_m)
-    assert said in text
+    assert text_part in text
 
 
 @dataclass
-class Passing(Turning):
-    """It passes a pole at each step, at constant speed."""
+class PassingDrive(TurningDrive):
+    """Drive past a pole at each step, at constant speed."""
 
     def topics(self) -> dict[str, TopicColumns]:
         found = super().topics()
@@ -89,56 +94,56 @@ class Passing(Turning):
         return found
 
 
-def test_conditions_by_a_guessed_outline_are_uncertain(tmp_path, capsys):
-    """A robot .33 m wide passes .16 m clear of poles: to a guess of .48 m each was too near."""
-    _, text = proposed(Passing(12.0, nearest_m=0.325).topics(), tmp_path)
+def test_conditions_with_guessed_outline_are_uncertain(tmp_path, capsys):
+    """A robot 0.33 m wide passes poles at 0.16 m; with a guess of 0.48 m each was too near."""
+    _, text = propose(PassingDrive(12.0, nearest_m=0.325).topics(), tmp_path)
     toml, store = tmp_path / "p.toml", tmp_path / "store"
     held = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
     marked = "SELECT uncertain_conditions FROM recordings"
 
-    def uncertain() -> list[str]:
+    def uncertain_conditions() -> list[str]:
         assert main(
             ["ingest", str(tmp_path / "bag"), "--profile", str(toml), "--store", str(store)]
         ) in (0, 3)
         with Store(store) as opened:
             assert opened.sql(held).fetchall() == [(0,)]
-            (named,) = opened.sql(marked).fetchall()[0]
-        return named
+            (names,) = opened.sql(marked).fetchall()[0]
+        return names
 
-    assert {"near_collision", "recovery"} <= {*uncertain()}
+    assert {"near_collision", "recovery"} <= {*uncertain_conditions()}
     capsys.readouterr()
     main(["coverage", str(store)])
     main(["mix", str(store), "--mixture", "coverage", "--dry-run"])
-    said = capsys.readouterr()
-    assert (said.out + said.err).count("outline is a guess") == 2
-    toml.write_text(text.replace('outline = "default"', "#"))  # measured: it is of that size
-    assert uncertain() == []
+    printed = capsys.readouterr()
+    assert (printed.out + printed.err).count("outline is a guess") == 2
+    toml.write_text(text.replace('outline = "default"', "#"))  # as if measured, with the same size
+    assert uncertain_conditions() == []
 
 
-def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path):
-    """A post of its own .21 m behind; a wall at .3 m once."""
-    profile, text = proposed(Turning(12.0, nearest_m=0.3, post_m=0.21).topics(), tmp_path)
+def test_own_parts_belong_to_body(tmp_path):
+    """The robot's own post is 0.21 m behind; a wall is 0.3 m away once."""
+    profile, text = propose(TurningDrive(12.0, nearest_m=0.3, post_m=0.21).topics(), tmp_path)
     body = profile.task.body
-    assert body.length_m == pytest.approx(0.42, abs=1e-3)  # the post is part of it
+    assert body.length_m == pytest.approx(0.42, abs=1e-3)  # includes the post
     assert profile.task.range_min_m == pytest.approx(0.225)
     assert "range_min_m = 0.225  # beyond the robot's own parts" in text
 
 
-def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path):
+def test_objects_beside_unturned_robot_are_not_own_parts(tmp_path):
     straight = {"/amcl_pose": Drive(12.0).topics()["/amcl_pose"]}
-    profile, _ = proposed(Turning(12.0, post_m=0.21).topics() | straight, tmp_path)
+    profile, _ = propose(TurningDrive(12.0, post_m=0.21).topics() | straight, tmp_path)
     assert profile.task.range_min_m == pytest.approx(0.02)
     assert profile.task.body.length_m == pytest.approx(0.2625)
 
 
 def lidar_at(x_m: float, y_m: float, yaw_rad: float, roll_rad: float = 0.0) -> TopicColumns:
-    """Return the transform of the scans' frame, rolled and then turned."""
+    """Return the transform of the scans' frame: roll, then yaw."""
     return transforms(np.zeros(1), ("base_link", "lidar", x_m, y_m, yaw_rad, roll_rad))[1]
 
 
 @dataclass
-class Framed(Turning):
-    """Its scans say in which frame they are."""
+class FramedScanDrive(TurningDrive):
+    """Drive whose scans name their frame."""
 
     def topics(self) -> dict[str, TopicColumns]:
         found = super().topics()
@@ -146,10 +151,10 @@ class Framed(Turning):
         return found
 
 
-def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path):
-    """At a corner, as one of two is. How it is turned was dropped, with its place."""
+def test_guessed_outline_includes_lidar_position(tmp_path):
+    """The lidar is at a corner. Its yaw used to be dropped together with its position."""
     more = {"/tf_static": lidar_at(-0.35, -0.3, -2.356)}
-    profile, text = proposed(Framed(12.0).topics() | more, tmp_path)
+    profile, text = propose(FramedScanDrive(12.0).topics() | more, tmp_path)
     body = profile.task.body
     assert (body.length_m, body.width_m) == pytest.approx((0.7, 0.6), abs=1e-3)
     scan = profile.inputs.scans["scan"]
@@ -159,33 +164,35 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path):
     assert "upside_down" not in text
 
 
-def test_a_lidar_outside_the_outline_is_turned_by_transforms(tmp_path):
-    """Its base frame is no middle, as that of a car, between its rear wheels."""
+def test_lidar_outside_outline_keeps_its_yaw(tmp_path):
+    """The base frame is off centre, as on a car, between the rear wheels."""
     more = {"/tf_static": lidar_at(0.9, 0.0, 3.0)}
-    profile, text = proposed(Framed(12.0).topics() | more, tmp_path, "--footprint", "1.2x0.6")
+    profile, text = propose(
+        FramedScanDrive(12.0).topics() | more, tmp_path, "--footprint", "1.2x0.6"
+    )
     body = profile.task.body
     assert (body.length_m, body.lidar_x_m, body.lidar_yaw_rad) == (1.2, 0.0, pytest.approx(3.0))
     assert "; a guess; base_link has it 0.90 m ahead, outside" in text
 
 
-def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
-    """By its frame. What it sees on the robot's left, it reports on its own right."""
+def test_upside_down_lidar_gives_the_same_rows(tmp_path, capsys):
+    """The transform says so: an object on the robot's left is on the lidar's right."""
     found, texts = [], []
     for roll, sign in ((0.0, 1), (np.pi, -1)):
-        topics = Framed(12.0, near_scans=60).topics()
+        topics = FramedScanDrive(12.0, near_scans=60).topics()
         scan = topics["/scan"].fields
         for angle in ("angle_min", "angle_max", "angle_increment"):
             if angle in scan:
                 scan[angle] = sign * np.asarray(scan[angle])
         topics["/tf_static"] = lidar_at(0.1, 0.0, 0.3, roll)
-        place = tmp_path / str(sign)
-        _, text = proposed(topics, place)
-        said = capsys.readouterr()
-        assert ("hangs upside down by its frame" in said.out + said.err) == (sign < 0)
-        with ingested.ingested(place / "bag", place / "p.toml", place / "store") as opened:
+        folder = tmp_path / str(sign)
+        _, text = propose(topics, folder)
+        printed = capsys.readouterr()
+        assert ("hangs upside down by its frame" in printed.out + printed.err) == (sign < 0)
+        with ingested.ingested(folder / "bag", folder / "p.toml", folder / "store") as opened:
             found.append(opened.sql("SELECT observation, action FROM transitions").fetchall())
         lines = text.splitlines()
-        texts.append({one.split("  #")[0] for one in lines if not one.startswith("#")})
+        texts.append({line.split("  #")[0] for line in lines if not line.startswith("#")})
     assert found[0] == found[1]
     assert len(found[0]) > 20
     assert texts[1] - texts[0] == {"upside_down = true"}
@@ -200,8 +207,8 @@ def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
         ("fleet-turtlebot3/dwa-goal/rosbag2_2025_12_16-15_31_16", (0.191, 0.191), (0, 0)),
     ],
 )
-def test_real_robots(name, size_m, lidar, tmp_path):
-    """A Neato is .33 m long, with its lidar behind the middle and turned about; a Burger .14 m."""
+def test_outlines_of_real_robots(name, size_m, lidar, tmp_path):
+    """A Neato is 0.33 m long with a backward lidar behind its middle; a Burger is 0.14 m long."""
     body = ingested.proposed(SHARED / name, tmp_path / "p.toml", codes=(0, 3)).task.body
     assert (body.length_m, body.width_m) == pytest.approx(size_m, abs=0.005)
     assert body.lidar_x_m == pytest.approx(lidar[0], abs=0.005)

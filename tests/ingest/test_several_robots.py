@@ -1,4 +1,4 @@
-"""Several robots in one recording: `restock profile new --robot` says whose profile it is."""
+"""Several robots in one recording: `restock profile new --robot` selects one."""
 
 from pathlib import Path
 
@@ -16,7 +16,10 @@ NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")
 
 
 def write_fleet(folder: Path, own: str = "") -> Path:
-    """`/robot2` drives longer and has a lidar; `/robot1` has none, and names with `own` in them."""
+    """Write a bag of `/robot1`, without a lidar, and `/robot2`, with a lidar and a longer drive.
+
+    Topics of `/robot1` start with `/robot1` + `own`.
+    """
     short, whole = typed_topics(Drive(duration_s=2.0)), typed_topics(Drive(duration_s=3.0))
     topics = {f"/robot1{own}{name}": short[name] for name in NEEDED}
     topics |= {f"/robot2{name}": whole[name] for name in (*NEEDED, "/scan")}
@@ -31,23 +34,25 @@ def write_fleet(folder: Path, own: str = "") -> Path:
         (["--robot", "/robot2/"], "/robot2", "/robot1"),
     ],
 )
-def test_the_profile_is_of_the_robot_that_was_named(flags, robot, other, tmp_path, shell):
+def test_profile_is_of_selected_robot(flags, robot, other, tmp_path, shell):
     document = shell.json("profile", "new", write_fleet(tmp_path), *flags)
     profile = parse_profile(document["toml"], where="proposed")
-    # Of one name, the audit stale_labels would take two robots' profiles for versions of one.
+    # With one name, the audit stale_labels would mistake two robots' profiles for versions of one.
     assert profile.name == ("fleet" if not flags else f"fleet_{robot.strip('/')}")
     inputs = profile.inputs
     used = (inputs.command, inputs.pose, inputs.wheels)
-    assert [one.topic for one in used if one is not None] == [f"{robot}{name}" for name in NEEDED]
+    assert [source.topic for source in used if source is not None] == [
+        f"{robot}{name}" for name in NEEDED
+    ]
     assert inputs.scan is not None
     assert inputs.scan.topic == ("/robot2/scan" if robot == "/robot2" else "/front/scan")
     assert document["transitions"] > 5
-    said = next(one["text"] for one in document["advice"] if one["key"] == "name")
-    assert said.startswith(f"of the robot {robot}, one of 2 in the recording: ")
-    assert f"--robot NAME` proposes a profile of another name for {other};" in said
+    advice = next(item["text"] for item in document["advice"] if item["key"] == "name")
+    assert advice.startswith(f"of the robot {robot}, one of 2 in the recording: ")
+    assert f"--robot NAME` proposes a profile of another name for {other};" in advice
 
 
-def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path):
+def test_topics_without_namespace_are_not_used(tmp_path):
     short, whole = typed_topics(Drive(duration_s=2.0)), typed_topics(Drive(duration_s=3.0))
     topics = {f"/robot{n}{name}": short[name] for name in NEEDED for n in (1, 2)}
     topics |= {name: whole[name] for name in ("/odom", "/amcl_pose")}  # with more messages
@@ -60,8 +65,8 @@ def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("robots", [(1, 2), (2,)])
-def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_path):
-    """As Nav2 has them where several robots are on one graph: `/robot2/tf`."""
+def test_transforms_of_own_namespace_are_used(robots, tmp_path):
+    """Nav2 uses `/robot2/tf` if several robots share a graph."""
     drive, topics = Drive(duration_s=4.0), {}
     at_s = np.arange(0, 4, 0.05)
     for n in robots:
@@ -78,9 +83,9 @@ def test_transforms_of_a_robots_own_namespace_are_its_transforms(robots, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["robot3", "front"])
-def test_an_absent_robot_is_refused_with_those_present(name, tmp_path, shell):
+def test_unknown_robot_is_rejected_with_existing_ones(name, tmp_path, shell):
     bag, out = write_fleet(tmp_path), tmp_path / "robot.toml"
-    said = " ".join(shell.err("profile", "new", bag, "--robot", name, "--out", out).split())
-    assert f"fleet: there is no robot /{name.strip('/')} in the recording" in said
-    assert "its robots are /robot1, /robot2" in said
+    stderr = " ".join(shell.err("profile", "new", bag, "--robot", name, "--out", out).split())
+    assert f"fleet: there is no robot /{name.strip('/')} in the recording" in stderr
+    assert "its robots are /robot1, /robot2" in stderr
     assert not out.exists()

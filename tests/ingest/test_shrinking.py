@@ -1,4 +1,4 @@
-"""Files that are no files, or do not stay as they are: a message, never a crash or silence."""
+"""Irregular files, and files that shrink while read, give a message, never a crash or silence."""
 
 import os
 import sqlite3
@@ -15,7 +15,7 @@ from support.shell import Shell
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 
-# Opens a recording, cuts it, and reads it: in a process of its own, as a signal would end it.
+# Opens a recording, truncates it and reads it, in its own process, as a signal would end it.
 SHRINK = """
 import os, sys
 from restock.errors import RecordingError
@@ -33,7 +33,7 @@ with open_recording(sys.argv[1]) as recording:
 
 
 @pytest.mark.parametrize("kind", ["chunks", "loose", "sqlite3"])
-def test_a_recording_that_shrinks_while_it_is_read(kind: str, tmp_path: Path) -> None:
+def test_recording_that_shrinks_while_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     if kind == "sqlite3":
         path = next(write_bag(tmp_path / "run", 300).glob("*.db3"))
@@ -46,19 +46,19 @@ def test_a_recording_that_shrinks_while_it_is_read(kind: str, tmp_path: Path) ->
         base.close()
     else:
         write_mcap(path, 300, compression=CompressionType.NONE, use_chunking=kind == "chunks")
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", SHRINK, str(path), "20000"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    said, _, why = done.stdout.partition(" ")
-    assert said == ("lost" if kind == "sqlite3" else "refused")
-    assert "shrank while it was read" in why or int(why.split()[0]) > 0
+    assert process.returncode == 0, process.stderr
+    outcome, _, detail = process.stdout.partition(" ")
+    assert outcome == ("lost" if kind == "sqlite3" else "refused")
+    assert "shrank while it was read" in detail or int(detail.split()[0]) > 0
 
 
-def test_a_pipe_is_refused(tmp_path: Path, shell: Shell) -> None:
+def test_pipe_is_rejected(tmp_path: Path, shell: Shell) -> None:
     pipe = tmp_path / "run.mcap"
     os.mkfifo(pipe)
     assert "a pipe, a socket or a device" in shell.err("info", pipe)
@@ -67,11 +67,11 @@ def test_a_pipe_is_refused(tmp_path: Path, shell: Shell) -> None:
         open_recording(pipe)
 
 
-def test_a_tail_of_zeros_is_damage(tmp_path: Path) -> None:
+def test_trailing_zeros_are_damage(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap")
     with path.open("ab") as file:
-        file.truncate(path.stat().st_size + (1 << 28))  # a hole
-    with open_recording(path) as recording:  # after the end of the recording
+        file.truncate(path.stat().st_size + (1 << 28))  # a sparse hole
+    with open_recording(path) as recording:  # the zeros are after the recording's end
         assert recording.messages == 140
     content = path.open("rb").read(8000)
     path.write_bytes(content)
@@ -83,7 +83,7 @@ def test_a_tail_of_zeros_is_damage(tmp_path: Path) -> None:
         assert 20 < recording.messages < 140
 
 
-def test_zeros_in_a_compressed_file_are_damage(tmp_path: Path) -> None:
+def test_zeros_in_compressed_file_are_damage(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap.zstd"
     head = b"\x89MCAP0\r\n" + b"\x01" + (8).to_bytes(8, "little") + bytes(8)
     path.write_bytes(zstandard.ZstdCompressor().compress(head + bytes(1 << 20)))
@@ -92,8 +92,8 @@ def test_zeros_in_a_compressed_file_are_damage(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_large_blobs_of_a_sqlite_bag_are_read_one_by_one(tmp_path: Path) -> None:
-    """Of 60 MB, and of 300: that is too large, and counted."""
+def test_large_sqlite_blobs_are_read_one_by_one(tmp_path: Path) -> None:
+    """Blobs of 60 MB are read; one of 300 MB is too large and counted as lost."""
     file = tmp_path / "run.db3"
     base = sqlite3.connect(file)
     base.executescript(
@@ -118,10 +118,10 @@ def test_large_blobs_of_a_sqlite_bag_are_read_one_by_one(tmp_path: Path) -> None
         "    text = open('/proc/self/status').read()\n"
         "    print(int(re.search('VmHWM:\\\\s+([0-9]+)', text)[1]) // 1024)\n"
     )
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=True
     )
-    *stamps, said, peak_mb = done.stdout.splitlines()
+    *stamps, reasons, peak_mb = process.stdout.splitlines()
     assert " ".join(stamps).split() == ["0", "1", "2", "3", "4", "6", "7"]
-    assert said == "['row 6 is not read: its message of 314,572,800 bytes is too large']"
+    assert reasons == "['row 6 is not read: its message of 314,572,800 bytes is too large']"
     assert int(peak_mb) < 450

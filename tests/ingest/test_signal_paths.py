@@ -1,4 +1,4 @@
-"""Signal paths: what they find in columns, and what they say where there is no such field."""
+"""Signal paths: the values they find in columns, and errors for missing fields."""
 
 import numpy as np
 import pytest
@@ -12,11 +12,11 @@ from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 
 
 def values_at(path: str, columns: dict[str, FieldColumn], end: str | None = None) -> list[list]:
-    """Return what a path finds, message by message."""
+    """Return the values that a path finds, message by message."""
     read = SignalPath.read(path)
-    got = read.find(columns, end)
+    found = read.find(columns, end)
     count = len(next(iter(columns.values())))
-    return [got.values[got.message == row].tolist() for row in range(count)]
+    return [found.values[found.message == row].tolist() for row in range(count)]
 
 
 JOINTS = {
@@ -32,15 +32,15 @@ STATUS = {
 
 
 FIXED = {"covariance": np.arange(12.0).reshape(3, 4)}
-FOUND = [
+PATHS_AND_VALUES = [
     (FIXED, "covariance[3]", [[3], [7], [11]]),
     (FIXED, "covariance[::3]", [[0, 3], [4, 7], [8, 11]]),
-    # By the name beside it; names without values beside them find nothing.
+    # Selected by the neighbouring name; names without values find nothing.
     (JOINTS, "velocity[left]", [[1.0], [4.0], [], []]),
     (JOINTS, "velocity[arm]", [[], [], [5.0], []]),
     (JOINTS | {"velocity": ragged([[], [3.0], [], []])}, "velocity[left]", [[], [], [], []]),
     (JOINTS | {"velocity": ragged([[], [3.0], [], []])}, "velocity[right]", [[], [3.0], [], []]),
-    # By what a field of it says; of two that say so, the first counts.
+    # Selected by a field's value; the first of two matches counts.
     (STATUS, "status[name=battery].values[key=v].value", [["24"], [], []]),
     (STATUS, "status[name=lidar].values[key=v].value", [[], ["9"], []]),
     (STATUS, "status[name=lidar].level", [[1], [2], []]),
@@ -52,8 +52,8 @@ FOUND = [
 ]
 
 
-@pytest.mark.parametrize(("columns", "path", "values"), FOUND)
-def test_what_a_path_finds(columns, path, values):
+@pytest.mark.parametrize(("columns", "path", "values"), PATHS_AND_VALUES)
+def test_path_finds_values(columns, path, values):
     assert values_at(path, columns) == values
 
 
@@ -63,16 +63,16 @@ def test_what_a_path_finds(columns, path, values):
     st.one_of(st.none(), st.integers(-7, 7)),
     st.integers(1, 4),
 )
-def test_slices_are_pythons(rows, start, stop, step):
+def test_slices_match_python(rows, start, stop, step):
     text = f"x[{'' if start is None else start}:{'' if stop is None else stop}:{step}]"
     assert values_at(text, {"x": ragged(rows)}) == [row[start:stop:step] for row in rows]
 
 
 @given(st.lists(st.lists(st.integers(-9, 9), max_size=6), min_size=1, max_size=5))
-def test_an_index_is_pythons(rows):
+def test_index_matches_python(rows):
     for index in range(-7, 7):
-        want = [[row[index]] if -len(row) <= index < len(row) else [] for row in rows]
-        assert values_at(f"x[{index}]", {"x": ragged(rows)}) == want
+        expected = [[row[index]] if -len(row) <= index < len(row) else [] for row in rows]
+        assert values_at(f"x[{index}]", {"x": ragged(rows)}) == expected
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_an_index_is_pythons(rows):
         ("a[::9999999999]", "an index has at most 9 digits"),
     ],
 )
-def test_invalid_paths(path, problem_text):
+def test_invalid_path_is_rejected(path, problem_text):
     with pytest.raises(PathProblem) as problem:
         SignalPath.read(path)
     assert problem_text in str(problem.value)
@@ -117,7 +117,7 @@ def leaves(kind: str) -> list[Leaf]:
         ("diagnostic_msgs/msg/DiagnosticArray", "status[0].values[0].valu", "].value'"),
     ],
 )
-def test_a_path_that_a_type_does_not_have(kind, path, problem_text):
+def test_path_missing_from_type_is_rejected(kind, path, problem_text):
     with pytest.raises(PathProblem) as problem:
         SignalPath.read(path).check(leaves(kind))
     assert problem_text in str(problem.value)

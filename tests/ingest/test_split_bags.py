@@ -1,4 +1,4 @@
-"""A bag of several files: which parts are missing, empty, copied or under another name."""
+"""Bags of several files: missing, empty, copied and renamed parts."""
 
 import shutil
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 
 PARTS = 3
-EACH = 70  # messages of a part
+EACH = 70  # messages per part
 
 
 def split_bag(folder: Path, ending: str = "db3") -> Path:
-    """Write a bag of three parts, with the metadata.yaml of all of them."""
+    """Write a bag of three parts, with one metadata.yaml for all of them."""
     folder.mkdir()
     every = list(messages(10 * PARTS))
     plugin = StoragePlugin.SQLITE3 if ending == "db3" else StoragePlugin.MCAP
@@ -41,19 +41,19 @@ def split_bag(folder: Path, ending: str = "db3") -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def intact_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("split")
     (folder / "mcap").mkdir()
     return {"db3": split_bag(folder / "run"), "mcap": split_bag(folder / "mcap" / "run", "mcap")}
 
 
 @pytest.fixture
-def split(whole: dict[str, Path], tmp_path: Path) -> Callable[..., Path]:
-    """Return a function: it returns a copy of the bag to spoil."""
-    return lambda ending="db3": shutil.copytree(whole[ending], tmp_path / "run")
+def split(intact_bags: dict[str, Path], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that copies the bag, so that the copy can be damaged."""
+    return lambda ending="db3": shutil.copytree(intact_bags[ending], tmp_path / "run")
 
 
-def without_metadata(folder: Path) -> None:
+def remove_metadata(folder: Path) -> None:
     (folder / "metadata.yaml").unlink()
 
 
@@ -61,101 +61,101 @@ def part(folder: Path, number: int) -> Path:
     return next(folder.glob(f"{folder.name}_{number}.*"))
 
 
-def seen(folder: Path, **options: bool) -> tuple[int, list[str], list[str]]:
+def open_and_describe(folder: Path, **options: bool) -> tuple[int, list[str], list[str]]:
     with open_recording(folder, **options) as recording:
         return recording.messages, [item.what for item in recording.damage], recording.notes
 
 
 @pytest.mark.parametrize("ending", ["db3", "mcap"])
-def test_a_whole_bag_is_whole(split, ending):
+def test_complete_bag_has_no_damage(split, ending):
     folder = split(ending)
-    assert seen(folder) == (PARTS * EACH, [], [])
-    without_metadata(folder)
-    assert seen(folder)[:2] == (PARTS * EACH, [])
+    assert open_and_describe(folder) == (PARTS * EACH, [], [])
+    remove_metadata(folder)
+    assert open_and_describe(folder)[:2] == (PARTS * EACH, [])
 
 
 @pytest.mark.parametrize("ending", ["db3", "mcap"])
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_part_that_is_missing_is_damage(split, ending, number, shell):
+def test_missing_part_is_damage(split, ending, number, shell):
     folder = split(ending)
     part(folder, number).unlink()
-    count, damage, _ = seen(folder)
+    count, damage, _ = open_and_describe(folder)
     assert count == 2 * EACH
     assert damage[0] == f"metadata.yaml lists run_{number}.{ending}, which is missing"
-    assert not any("numbers" in what for what in damage)
-    without_metadata(folder)
-    count, damage, _ = seen(folder)
+    assert not any("numbers" in text for text in damage)
+    remove_metadata(folder)
+    count, damage, _ = open_and_describe(folder)
     assert count == 2 * EACH
     assert damage == [f"run_{number}.{ending} is missing, by the numbers of its files"]
     assert f"run_{number}.{ending}" in shell.err("info", folder, code=3)
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_only_a_hole_is_damage_despite_the_metadata(split, number):
-    """As `ros2 bag reindex` makes it, of what is there; a recorder may keep the last parts."""
+def test_only_a_gap_in_numbers_is_damage_after_reindex(split, number):
+    """`ros2 bag reindex` lists the existing files; a recorder may keep only the last parts."""
     folder = split()
     part(folder, number).unlink()
     text = (folder / "metadata.yaml").read_text()
     text = text.replace(f"  - run_{number}.db3\n", "").replace("count: 30\n", "count: 20\n")
     (folder / "metadata.yaml").write_text(text)
     damage = ["run_1.db3 is missing, by the numbers of its files"] if number else []
-    assert seen(folder) == (2 * EACH, damage, [])
+    assert open_and_describe(folder) == (2 * EACH, damage, [])
 
 
-def rename(folder: Path) -> None:
+def rename_part(folder: Path) -> None:
     part(folder, 1).rename(folder / "middle.db3")
 
 
-def rename_all(folder: Path) -> None:
+def rename_parts(folder: Path) -> None:
     for number in range(PARTS):
         part(folder, number).rename(folder / f"drive_{number}.db3")
 
 
-@pytest.mark.parametrize("change", [rename, rename_all])
-def test_another_name_is_no_damage_where_every_message_is_there(split, change: Callable):
+@pytest.mark.parametrize("change", [rename_part, rename_parts])
+def test_renamed_parts_are_no_damage(split, change: Callable):
     folder = split()
     change(folder)
-    count, damage, notes = seen(folder)
+    count, damage, notes = open_and_describe(folder)
     assert (count, damage) == (PARTS * EACH, [])
     assert any("run_1.db3" in note for note in notes)
 
 
-def copy(folder: Path) -> None:
+def copy_part(folder: Path) -> None:
     shutil.copy(part(folder, 1), folder / "run_1 (copy).db3")
 
 
-def copy_as_next(folder: Path) -> None:
+def copy_as_next_part(folder: Path) -> None:
     shutil.copy(part(folder, 2), folder / "run_3.db3")
 
 
-def compress_too(folder: Path) -> None:
+def keep_compressed_too(folder: Path) -> None:
     plain = {file: file.read_bytes() for file in folder.glob("*.db3")}
     compress_files(folder)
     for file, content in plain.items():
         file.write_bytes(content)
 
 
-@pytest.mark.parametrize("change", [copy, copy_as_next, compress_too])
+@pytest.mark.parametrize("change", [copy_part, copy_as_next_part, keep_compressed_too])
 @pytest.mark.parametrize("metadata", [True, False])
-def test_a_copy_is_counted_once_and_named(split, change: Callable, metadata):
+def test_copied_part_is_read_once_and_noted(split, change: Callable, metadata):
     folder = split()
     change(folder)
     if not metadata:
-        without_metadata(folder)
-    if change is copy and not metadata:
-        return  # its name is none of a part: the files are several recordings
-    count, damage, notes = seen(folder)
+        remove_metadata(folder)
+    if change is copy_part and not metadata:
+        return  # its name is not that of a part, so the files are separate recordings
+    count, damage, notes = open_and_describe(folder)
     assert (count, damage) == (PARTS * EACH, [])
     assert any("read once" in note for note in notes)
 
 
-def test_a_part_without_bytes_is_refused_and_named_with_salvage(split):
+def test_empty_part_is_rejected_or_reported_by_salvage(split):
     folder = split()
-    without_metadata(folder)
+    remove_metadata(folder)
     part(folder, 1).write_bytes(b"")
     with pytest.raises(RecordingError, match=r"run_1\.db3: an empty file"):
         open_recording(folder)
-    count, damage, _ = seen(folder, salvage=True)
+    count, damage, _ = open_and_describe(folder, salvage=True)
     assert count == 2 * EACH
     assert damage == ["run_1.db3: an empty file"]
     part(folder, 0).write_bytes(b"")
@@ -164,14 +164,14 @@ def test_a_part_without_bytes_is_refused_and_named_with_salvage(split):
         open_recording(folder, salvage=True)
 
 
-def test_a_part_without_messages_before_the_last_is_damage(split, tmp_path):
+def test_part_without_messages_is_damage_unless_last(split, tmp_path):
     folder = split()
-    without_metadata(folder)
+    remove_metadata(folder)
     empty = tmp_path / "empty"
     with BagWriter(empty, version=9) as bag:
         bag.add_connection("/policy", TOPICS["/policy"], typestore=STORE)
     (file,) = empty.glob("*.db3")
-    shutil.copy(file, folder / "run_3.db3")  # the last: nothing more came
-    assert seen(folder)[:2] == (PARTS * EACH, [])
+    shutil.copy(file, folder / "run_3.db3")  # the last part: recording ended
+    assert open_and_describe(folder)[:2] == (PARTS * EACH, [])
     shutil.copy(file, part(folder, 1))
-    assert seen(folder)[:2] == (2 * EACH, ["run_1.db3 holds no message"])
+    assert open_and_describe(folder)[:2] == (2 * EACH, ["run_1.db3 holds no message"])

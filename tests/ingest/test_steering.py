@@ -1,4 +1,4 @@
-"""Robots that nothing describes: whether they steer as a car, by how they turned."""
+"""Robots without a description: detection of car-like steering from how they turned."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ ROBOTS = {
 
 
 def commands(seed: int, *, spot: bool) -> Any:
-    """(T, 2) as of a person with a remote: each held for .6 to 3 s; with turns on the spot."""
+    """Return remote-control commands (T, 2), each held for 0.6 to 3 s; `spot` adds pivots."""
     rng, held = np.random.default_rng(seed), []
     if spot:
         held += [(0.0, 1.2)] * 10 + [(0.4, 0.0)] * 10 + [(0.0, -1.2)] * 10
@@ -40,8 +40,8 @@ def commands(seed: int, *, spot: bool) -> Any:
     return np.array(held[:STEPS])
 
 
-def shown(name: str, seed: int, *, spot: bool) -> DriveEvidence:
-    """Return what such a drive of the twin's robot shows, by a localiser's poses."""
+def evidence_of(name: str, seed: int, *, spot: bool) -> DriveEvidence:
+    """Return the evidence in such a drive of the twin's robot, with localiser poses."""
     robot, body = ROBOTS[name]
     reported = commands(seed, spot=spot)
     still = (
@@ -58,16 +58,16 @@ def shown(name: str, seed: int, *, spot: bool) -> DriveEvidence:
 
 @pytest.mark.parametrize("seed", one_in(2, range(2)))
 @pytest.mark.parametrize("name", ROBOTS)
-def test_drives_of_the_twin_tell_a_robot_that_steers(name: str, seed: int) -> None:
-    found = shown(name, seed, spot=True)
+def test_car_like_steering_is_detected_in_twin_drives(name: str, seed: int) -> None:
+    found = evidence_of(name, seed, spot=True)
     assert found.steers is (name == "ackermann")
     assert "commanded to turn on the spot, by" in found.why
-    gentle = shown(name, seed, spot=False)
+    gentle = evidence_of(name, seed, spot=False)
     assert not gentle.steers or name == "ackermann"
 
 
-def bag(folder: Path, *, pivots: bool) -> Path:
-    """20 s: ahead, and told twice to turn on the spot."""
+def write_pivot_bag(folder: Path, *, pivots: bool) -> Path:
+    """Write 20 s of driving ahead with two commands to turn on the spot."""
     time_s = np.arange(0, 20, 0.05)
     spot = (time_s % 10 > 4) & (time_s % 10 < 8)
     speed, turn = np.where(spot, 0.0, 0.4), np.where(spot, 0.8, 0.0)
@@ -91,11 +91,11 @@ def bag(folder: Path, *, pivots: bool) -> Path:
     )
 
 
-def test_a_proposal_names_a_robot_that_steers_with_its_evidence(tmp_path, shell):
+def test_proposal_reports_car_like_steering_with_evidence(tmp_path, shell):
     file = tmp_path / "car.toml"
-    source = bag(tmp_path / "bag", pivots=False)
-    said = shell.json("profile", "new", source, "--out", file)["advice"]
-    advice = {one["key"]: one["text"] for one in said}
+    source = write_pivot_bag(tmp_path / "bag", pivots=False)
+    items = shell.json("profile", "new", source, "--out", file)["advice"]
+    advice = {item["key"]: item["text"] for item in items}
     assert "STEERS LIKE A CAR: commanded to turn on the spot, by 6.3" in advice["robot.drive"]
     assert "# CONFIRM THAT IT STEERS LIKE A CAR" in file.read_text()
     assert "angular.z is read as a yaw rate" in advice["inputs.command"]

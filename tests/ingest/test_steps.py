@@ -1,4 +1,4 @@
-"""Topics to steps: what each tick sees, and why a tick cannot be used."""
+"""From topics to steps: the signals of each tick, and reasons for unusable ticks."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from restock.ingest.steps.filling import parse_policy
 PROFILE = load_profile("warehouse_amr")
 
 
-def test_every_signal_of_a_straight_drive():
+def test_signals_of_a_straight_drive():
     steps = steps_of(PROFILE, Drive().topics())
     assert len(steps) == 30
     assert set(steps.problem) == set(steps.route_problem) == {""}
@@ -40,18 +40,18 @@ def test_every_signal_of_a_straight_drive():
     assert now["waypoint_far_x_m"] == pytest.approx(np.full(30, 2.2))
     front = PROFILE.task.body.length_m / 2 - PROFILE.task.body.lidar_x_m
     assert now["clearance_ahead_m"] == pytest.approx(np.full(30, FREE_M - front), abs=0.02)
-    assert set(steps.action) == {1}  # .4 m/s straight ahead
+    assert set(steps.action) == {1}  # 0.4 m/s straight ahead
     assert steps.residual == pytest.approx(np.zeros(30))
     assert set(steps.policy) == {"planner"}
     assert steps.follows.tolist() == [False] + [True] * 29
 
 
-def test_nothing_of_a_step_comes_from_later_messages():
-    """Cut the recording after any tick: the steps up to it stay what they were."""
+def test_steps_do_not_depend_on_later_messages():
+    """Truncating the recording after a tick keeps the steps up to it."""
     topics = Drive().topics()
     whole = steps_of(PROFILE, topics)
     for tick in (3, 11, 20):
-        end = whole.signals["stamp_ns"][tick] + 2_000_000  # the latency of the tick's command
+        end = whole.signals["stamp_ns"][tick] + 2_000_000  # latency of the tick's command
         cut = {name: without(topic, topic.log_time_ns <= end) for name, topic in topics.items()}
         part = steps_of(PROFILE, cut)
         assert len(part) == tick + 1
@@ -59,7 +59,7 @@ def test_nothing_of_a_step_comes_from_later_messages():
             np.testing.assert_array_equal(column, whole.signals[name][: tick + 1], name)
 
 
-def test_what_was_never_received_is_said_so():
+def test_topic_not_yet_received_is_reported():
     topics = Drive().topics()
     late = (topics["/imu"].log_time_ns - START_NS) * 1e-9
     topics["/imu"] = without(topics["/imu"], late > 1)
@@ -74,11 +74,11 @@ SPEED = "twist.twist.linear.x"
 @pytest.mark.parametrize(
     ("topic", "field", "values", "problem", "ticks"),
     [
-        # Numbers that are none, at 2 s: the odometry held at one tick.
+        # Invalid numbers at 2 s: the odometry held at one tick.
         *(("/odom", SPEED, (100, 110, bad), "wheels: not finite", 1) for bad in (np.nan, 1e300)),
-        # All four numbers of an orientation are zero for a second.
+        # A zero quaternion for one second.
         ("/amcl_pose", "pose.pose.orientation.w", (30, 40, 0.0), "pose: not finite", 5),
-        # Angles in degrees, or not filled in: that is no free floor.
+        # Angles in degrees, or not filled in, must not count as free space.
         *(
             ("/scan", field, (30, 40, value), "scan: unusable angles", 5)
             for field, value in (
@@ -88,7 +88,7 @@ SPEED = "twist.twist.linear.x"
         ),
     ],
 )
-def test_values_of_no_use_make_ticks_unusable(topic, field, values, problem, ticks):
+def test_invalid_values_make_ticks_unusable(topic, field, values, problem, ticks):
     topics = Drive().topics()
     first, last, value = values
     topics[topic].fields[field][first:last] = value
@@ -98,17 +98,17 @@ def test_values_of_no_use_make_ticks_unusable(topic, field, values, problem, tic
     assert np.isfinite(steps.signals["wheel_speed_mps"]).all()
 
 
-def test_positions_far_from_their_origin_are_refused():
-    """UTM northings: finite, but float32 tells no centimetres there."""
+def test_positions_far_from_origin_are_rejected():
+    """UTM northings are finite, but float32 cannot resolve centimetres there."""
     topics = Drive().topics()
     topics["/amcl_pose"].fields["pose.pose.position.y"][:] += 5.2e6
     steps = steps_of(PROFILE, topics)
     assert set(steps.problem) == {"pose: beyond a million"}
-    why, remedy = explain_no_transitions(steps, split(PROFILE.task, steps))
-    assert f"pose: beyond a million: {len(steps)} of {len(steps)} ticks" in why
+    reason, remedy = explain_no_transitions(steps, split(PROFILE.task, steps))
+    assert f"pose: beyond a million: {len(steps)} of {len(steps)} ticks" in reason
     assert remedy is not None
     assert "set `origin_m = [X, Y]`" in remedy
-    # With an origin near them, poses, goals and plans are what they are without the offset.
+    # With an origin near them, poses, goals and plans equal those without the offset.
     for topic, path in (("/goal_pose", "pose.position.y"), ("/plan", "poses[].pose.position.y")):
         column = topics[topic].fields[path]
         (column.values if isinstance(column, Ragged) else column)[:] += 5.2e6
@@ -121,29 +121,29 @@ def test_positions_far_from_their_origin_are_refused():
         assert moved.signals[name] == pytest.approx(column, abs=1e-6, nan_ok=True), name
 
 
-def proposed(time_s, speed_mps):
+def nav_commands(time_s, speed_mps):
     fields = {"linear.x": np.asarray(speed_mps, float), "angular.z": np.full(len(time_s), -0.2)}
     return columns(np.asarray(time_s), fields, stamped=False)
 
 
-def test_a_proposal_is_the_latest_at_or_before_the_tick():
+def test_nav_command_is_latest_at_or_before_tick():
     topics = Drive().topics()
     commands_s = 0.005 + np.arange(30) * PERIOD_S  # the ticks
-    # One 3 ms ahead of each tick, one at the tick itself, and one 1 ms after it.
+    # One 3 ms before each tick, one at the tick, and one 1 ms after it.
     times = np.sort(np.concatenate([commands_s - 0.003, commands_s, commands_s + 0.001]))
     for keep, expected in (([0, 1, 2], 0.2), ([0, 2], 0.1)):
         chosen = np.isin(np.arange(90) % 3, keep)
         speeds = np.tile([0.1, 0.2, 0.9], 30)
-        topics["/cmd_vel_nav"] = proposed(times[chosen], speeds[chosen])
+        topics["/cmd_vel_nav"] = nav_commands(times[chosen], speeds[chosen])
         steps = steps_of(PROFILE, topics)
         assert steps.signals["nav_speed_mps"] == pytest.approx(np.full(30, expected))
         assert steps.signals["nav_yaw_rate_radps"] == pytest.approx(np.full(30, -0.2))
         assert not [note for note in steps.notes if "nav_command" in note]
 
 
-def test_an_unknown_proposal_leaves_the_tick_usable():
+def test_unknown_nav_command_keeps_tick_usable():
     topics = Drive().topics()
-    topics["/cmd_vel_nav"] = proposed([1.0, 1.2, 1.4, 1.6, 3.0], [0.5, 0.5, np.nan, 0.5, 0.5])
+    topics["/cmd_vel_nav"] = nav_commands([1.0, 1.2, 1.4, 1.6, 3.0], [0.5, 0.5, np.nan, 0.5, 0.5])
     steps = steps_of(PROFILE, topics)
     known = np.isfinite(steps.signals["nav_speed_mps"])
     assert np.flatnonzero(known).tolist() == [5, 6, 8, 9, 10, 15, 16, 17]
@@ -155,13 +155,13 @@ def test_an_unknown_proposal_leaves_the_tick_usable():
     assert set(steps.problem) == {""}
 
 
-def test_the_same_goal_again_is_no_new_goal():
+def test_repeated_goal_is_not_a_new_goal():
     drive = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 1.0), (4.0, 11.0, 1.005)])
     steps = steps_of(PROFILE, drive.topics())
     assert set(steps.routing.goal) == {0}
 
 
-def test_a_handover_is_on_the_tick_it_takes_force():
+def test_handover_takes_effect_at_its_tick():
     text = '{"policy": "operator", "version": "2", "probability": 0.5}'
     drive = Drive(policies=[(0.0, "planner"), (2.0, text)])
     steps = steps_of(PROFILE, drive.topics())
@@ -171,7 +171,7 @@ def test_a_handover_is_on_the_tick_it_takes_force():
     assert steps.probability[9:11] == [None, 0.5]
 
 
-def test_policies_are_json_or_a_bare_name():
+def test_parse_policy_accepts_json_or_name():
     assert parse_policy('{"policy": "dqn", "version": 3}') == ("dqn", "3", None)
     assert parse_policy(" planner ") == ("planner", None, None)
     assert parse_policy("") == ("unknown", None, None)
@@ -181,9 +181,9 @@ def test_policies_are_json_or_a_bare_name():
         assert parse_policy(text) == (text, None, None)
 
 
-@pytest.mark.parametrize("said", ["-3", "0", "NaN", '"high"', "9" * 400])
-def test_a_probability_that_is_none_is_unknown_and_counted(said):
-    texts = [(0.0, f'{{"policy": "dqn", "probability": {said}}}'), (2.0, "planner")]
+@pytest.mark.parametrize("probability", ["-3", "0", "NaN", '"high"', "9" * 400])
+def test_invalid_probability_is_unknown_and_counted(probability):
+    texts = [(0.0, f'{{"policy": "dqn", "probability": {probability}}}'), (2.0, "planner")]
     steps = steps_of(PROFILE, Drive(policies=texts).topics())
     assert steps.policy[:10] == ["dqn"] * 10
     assert steps.probability == [None] * 30
@@ -193,7 +193,7 @@ def test_a_probability_that_is_none_is_unknown_and_counted(said):
     ) in steps.notes
 
 
-def test_a_robot_that_was_carried_does_not_drive_on():
+def test_pose_jump_breaks_episode():
     topics = Drive().topics()
     topics["/amcl_pose"].fields["pose.pose.position.x"][30:] += 3.0
     steps = steps_of(PROFILE, topics)
@@ -201,20 +201,20 @@ def test_a_robot_that_was_carried_does_not_drive_on():
         "start of the recording",
         "pose jump",
     ]
-    # No speed is made up across the jump.
+    # The jump adds no speed.
     assert steps.signals["localised_speed_mps"] == pytest.approx(np.full(30, SPEED_MPS))
 
 
-def test_at_a_fixed_rate_the_longest_action_counts():
+def test_longest_action_of_a_fixed_rate_step_counts():
     topics, count = Drive().topics(), np.arange(25)
-    # Commands every .2 s that drift 4 ms a tick against the ticks, alternating.
+    # Commands every 0.2 s that drift by 4 ms per tick against the ticks, alternating.
     fields = {"linear.x": np.where(count % 2, 1.0, 0.4), "angular.z": np.zeros(25)}
     topics["/cmd_vel"] = columns(0.005 + count * 0.204, fields, stamped=False)
     steps = steps_of(replace(PROFILE, clock=Clock(steps="rate")), topics)
     assert steps.action[:20].tolist() == [1, 2] * 10
 
 
-def test_without_imu_and_goal_the_stand_ins_are_used():
+def test_fallbacks_replace_missing_topics():
     topics, time = Drive().topics(), np.arange(0, 6, 0.02)
     topics["/odom"].fields.update(pose("pose.pose", 1 + SPEED_MPS * time, 1.0))
     kept = {name: topics[name] for name in ("/cmd_vel", "/scan", "/imu", "/odom")}
@@ -226,7 +226,7 @@ def test_without_imu_and_goal_the_stand_ins_are_used():
     assert (steps.routing.goal == -1).all()
 
 
-def test_an_optional_topic_without_messages_is_replaced():
+def test_empty_optional_topic_uses_fallback():
     topics = Drive().topics()
     empty = topics | {"/bumper": without(topics["/bumper"], np.zeros(60, np.bool_))}
     bumper = replace(PROFILE.inputs.bumper, optional=True)

@@ -1,4 +1,4 @@
-"""The store's writer, in a folder and on S3: whole or not at all, whoever else is writing."""
+"""The store's writer, in a folder and on S3: atomic commits, also with concurrent writers."""
 
 import multiprocessing
 import os
@@ -25,23 +25,23 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
 
-def test_what_is_written_is_read_with_every_type(place):
+def test_written_rows_are_read_with_their_types(place):
     manifest, rows = one(1)
     version = StoreWriter(place).write(manifest, rows)
     with restock.open(place) as store:
         assert store.version == version
         assert str(store.path) == str(place)
         found = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
-    assert found["logged_ns"].to_pylist() == rows["stamp_ns"].to_pylist()  # it is null in `rows`
+    assert found["logged_ns"].to_pylist() == rows["stamp_ns"].to_pylist()  # null in `rows`
     for name in rows.drop_columns("logged_ns").column_names:
-        shown = "primary_condition" if name == "condition" else name
-        assert found[shown].to_pylist() == rows[name].to_pylist(), name
+        public_name = "primary_condition" if name == "condition" else name
+        assert found[public_name].to_pylist() == rows[name].to_pylist(), name
     assert found.schema.field("observation").type.list_size == len(rows["observation"][0])
     written = [file for file in files_of(place) if file.startswith("transitions/0")]
     assert written == ["transitions/0000000000000001/0000000000000001-a.parquet"]
 
 
-def test_a_recording_written_again_replaces_its_own_rows(place):
+def test_rewritten_recording_replaces_its_rows(place):
     writer = StoreWriter(place)
     version = writer.write(*one(1, "a"))
     writer.write(*one(2, "b"))
@@ -52,8 +52,8 @@ def test_a_recording_written_again_replaces_its_own_rows(place):
         second["ingest_id"][0].as_py(): len(second),
     }
     assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(place))
-    # An old version keeps its manifests: they are taken out of `recordings` when the rows are
-    # replaced, and found by their names until they are cleaned away.
+    # An old version keeps its manifests: they leave `recordings` when the rows are replaced, and
+    # are found by name until they are cleaned.
     with Store(place, version=version) as store:
         old_ingest = [("0000000000000001-a",)]
         assert store.sql("SELECT DISTINCT ingest_id FROM transitions").fetchall() == old_ingest
@@ -70,8 +70,8 @@ def _write(place: Path | str, recording: int, ingest: str) -> None:
 
 
 @pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
-def test_writers_at_the_same_time_lose_and_double_nothing(place):
-    """Processes that all make the store, two of them with the same recording."""
+def test_concurrent_writers_lose_and_duplicate_nothing(place):
+    """All processes create the store; two of them write the same recording."""
     context = multiprocessing.get_context("spawn")
     jobs = [(1, "a"), (1, "b"), (2, "a")]
     processes = [context.Process(target=_write, args=(place, *job)) for job in jobs]
@@ -87,23 +87,23 @@ def test_writers_at_the_same_time_lose_and_double_nothing(place):
         assert count == len(one(int(recording, 16), name)[1])
 
 
-def test_a_reader_between_two_commits_sees_the_recording(tmp_path, monkeypatch):
-    """It opens the rows as they were, and their manifest is gone when it looks."""
+def test_reader_between_two_commits_sees_recording(tmp_path, monkeypatch):
+    """The reader opens the old rows, and their manifest is gone when it looks."""
     path = tmp_path / "s"
     StoreWriter(path).write(*one(1, "a"))
     open_table = Location.open_table
 
-    def overtaken(self, name, *rest):
+    def open_after_write(self, name, *rest):
         if name == RECORDINGS:
             monkeypatch.undo()
             StoreWriter(path).write(*one(1, "b"))
         return open_table(self, name, *rest)
 
-    monkeypatch.setattr(Location, "open_table", overtaken)
+    monkeypatch.setattr(Location, "open_table", open_after_write)
     assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
 
 
-def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
+def test_orphans_are_cleaned_only_after_retention(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
     orphan = tmp_path / "s" / "transitions" / "00000000000000ff" / "x.parquet"
@@ -122,55 +122,55 @@ def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
 
 
 def with_payload(recording: int) -> tuple[pa.Table, pa.Table]:
-    """Return tables of a recording with a signal of its profile's own."""
+    """Return tables of a recording with a custom signal."""
     manifest, rows = one(recording)
     return manifest, rows.append_column("payload_kg", pa.array([3.0] * len(rows)))
 
 
-def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypatch):
+def test_columns_added_by_two_writers_are_added_once(tmp_path, monkeypatch):
     path = tmp_path / "s"
     StoreWriter(path).write(*one(1))
     open_table = Location.open_table
 
-    def overtaken(self, name, *rest):
+    def open_before_write(self, name, *rest):
         table = open_table(self, name, *rest)
         if name == TRANSITIONS:
             monkeypatch.undo()
             StoreWriter(path).write(*with_payload(2))
         return table
 
-    monkeypatch.setattr(Location, "open_table", overtaken)
+    monkeypatch.setattr(Location, "open_table", open_before_write)
     StoreWriter(path).write(*with_payload(3))
     assert len(shown(path)) == 3
 
 
-def test_a_commit_whose_answer_was_lost_is_not_done_twice(tmp_path, monkeypatch):
+def test_commit_with_lost_response_is_not_repeated(tmp_path, monkeypatch):
     transact, writer = StoreWriter.transact, StoreWriter(tmp_path / "s")
 
-    def lose_the_next_answer() -> None:
-        def lost(self, *args):
+    def lose_next_response() -> None:
+        def transact_without_response(self, *args):
             transact(self, *args)
             monkeypatch.setattr(StoreWriter, "transact", transact)
             raise CommitFailedError("the answer was lost")
 
-        monkeypatch.setattr(StoreWriter, "transact", lost)
+        monkeypatch.setattr(StoreWriter, "transact", transact_without_response)
 
     writer.write_all([one(1, "a"), one(2)])
-    lose_the_next_answer()
+    lose_next_response()
     writer.write(*one(1, "b"))
     assert set(shown(tmp_path / "s")) == {"0000000000000001-b", "0000000000000002-a"}
-    lose_the_next_answer()
-    done = remove_recordings(writer, ["0000000000000002"])
-    assert done.version == done.version_before + 1
+    lose_next_response()
+    removal = remove_recordings(writer, ["0000000000000002"])
+    assert removal.version == removal.version_before + 1
     assert set(shown(tmp_path / "s")) == {"0000000000000001-b"}
     assert DeltaTable(str(tmp_path / "s" / RECORDINGS)).count() == 1
 
 
-def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkeypatch):
-    """Root, who may run the tests, may write all: this is what delta-rs says to others."""
+def test_read_only_store_is_reported_as_not_writable(tmp_path, monkeypatch):
+    """Simulated error of delta-rs, as root, who may run the tests, may write everywhere."""
     StoreWriter(tmp_path / "s").write(*one(1))
 
-    def denied(self, *args, **given):
+    def denied(self, *args, **options):
         arrow = "\n \x1b[31m↳\x1b[0m "
         raise OSError(
             arrow.join(["Generic LocalFileSystem error", "Permission denied (os error 13)"])
@@ -182,7 +182,7 @@ def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkey
     assert len(shown(tmp_path / "s")) == 1
 
 
-def test_a_writer_overtaken_by_another_loses_nothing(tmp_path, before_commit):
+def test_concurrent_write_loses_nothing(tmp_path, before_commit):
     path = tmp_path / "s"
     StoreWriter(path).write(*one(2))
     before_commit(lambda: StoreWriter(path).write(*one(1, "b")), TRANSITIONS)
@@ -192,7 +192,7 @@ def test_a_writer_overtaken_by_another_loses_nothing(tmp_path, before_commit):
     assert {Path(uri).stem for uri in manifests} == set(shown(path))
 
 
-def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
+def test_new_columns_are_null_in_old_rows(tmp_path):
     path = tmp_path / "s"
     StoreWriter(path).write(*one(1))
     StoreWriter(path).write(*with_payload(2))
@@ -205,28 +205,28 @@ def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "said"),
+    ("file", "message"),
     [("panel.json", "is a panel, not a store"), ("config.json", "is the folder of a run")],
 )
-def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, file, said, shell):
+def test_writing_into_panel_or_run_is_rejected(tmp_path, file, message, shell):
     (tmp_path / file).write_text("{}")
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         StoreWriter(tmp_path).write(*one(1))
-    # Said once, before a recording is read.
+    # Reported once, before any recording is read.
     recordings = [str(ROOT / "sample_logs" / name) for name in ("amr_monday.mcap", "amr_tuesday")]
-    reported = shell.err("ingest", *recordings, "--store", tmp_path)
-    assert (reported.count(said), "was not added" in reported) == (1, False)
+    stderr = shell.err("ingest", *recordings, "--store", tmp_path)
+    assert (stderr.count(message), "was not added" in stderr) == (1, False)
     assert [path.name for path in tmp_path.iterdir()] == [file]
 
 
-def test_a_store_with_such_a_file_beside_its_tables_is_one(tmp_path):
+def test_store_with_config_file_beside_its_tables(tmp_path):
     StoreWriter(tmp_path).write(*one(1))
     (tmp_path / "config.json").write_text("{}")
     assert StoreWriter(tmp_path).write(*one(2)) == 2
 
 
 @pytest.mark.parametrize(
-    ("place", "said"),
+    ("place", "message"),
     [
         ("", "the name of the store is empty"),
         ("gs://bucket/store", "cannot be on gs:"),
@@ -234,16 +234,16 @@ def test_a_store_with_such_a_file_beside_its_tables_is_one(tmp_path):
         ("s3://bucket/some%20where", "percent sign"),
     ],
 )
-def test_places_that_cannot_hold_a_store_are_refused(place, said, tmp_path, monkeypatch):
+def test_invalid_store_address_is_rejected(place, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         StoreWriter(place)
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         Store(place)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_of_other_tools_are_refused_by_name(tmp_path):
+def test_files_written_by_other_tools_are_rejected(tmp_path):
     path = tmp_path / "s"
     StoreWriter(path).write(*one(1))
     writer, table = StoreWriter(path), DeltaTable(str(path / "transitions"))
@@ -253,7 +253,7 @@ def test_files_of_other_tools_are_refused_by_name(tmp_path):
         StoreWriter(path).write(*one(3))
 
 
-def test_floats_are_split_by_byte_and_compressed(tmp_path):
+def test_floats_are_byte_stream_split_and_compressed(tmp_path):
     manifest, rows = one(1)
     StoreWriter(tmp_path / "s").write(manifest, rows)
     (file,) = (tmp_path / "s" / "transitions").glob("*/*.parquet")
@@ -264,11 +264,13 @@ def test_floats_are_split_by_byte_and_compressed(tmp_path):
     assert "BYTE_STREAM_SPLIT" in columns["pose_x_m"].encodings
 
 
-def test_a_store_that_may_not_be_read_is_not_called_damaged(tmp_path: Path) -> None:
-    """Root, who may run the tests, may read all: this is what delta-rs says to others."""
-    said = "Generic LocalFileSystem error\n ↳ IO error for operation on /s/_delta_log\x1b[0m\n ↳ "
+def test_unreadable_store_is_reported_as_permission_error(tmp_path: Path) -> None:
+    """Simulated error of delta-rs, as root, who may run the tests, may read everything."""
+    message = (
+        "Generic LocalFileSystem error\n ↳ IO error for operation on /s/_delta_log\x1b[0m\n ↳ "
+    )
     for error in (
-        OSError(f"{said}Permission denied (os error 13)"),
+        OSError(f"{message}Permission denied (os error 13)"),
         DeltaError("Permission denied"),
     ):
         with pytest.raises(StoreError) as caught, Location.of(tmp_path).translate_errors():
@@ -282,20 +284,20 @@ def test_a_store_that_may_not_be_read_is_not_called_damaged(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("scheme", ["s3", "s3a", "https"])
 @pytest.mark.parametrize("secret", ["hush", "hu/sh", "hu@sh"])
-def test_a_secret_in_an_address_is_refused_and_not_repeated(scheme, secret):
+def test_secret_in_address_is_rejected_and_hidden(scheme, secret):
     with pytest.raises(StoreError, match="must not hold a key and its secret") as caught:
         Location.of(f"{scheme}://AKIA:{secret}@bucket/store")
-    said = str(caught.value)
-    assert f"{scheme}://***:***@bucket/store" in said
-    assert "hu" not in said
-    assert "AKIA:" not in said
+    message = str(caught.value)
+    assert f"{scheme}://***:***@bucket/store" in message
+    assert "hu" not in message
+    assert "AKIA:" not in message
 
 
-def test_a_version_of_a_store_on_s3_is_no_secret():
+def test_version_in_s3_address_is_not_a_secret():
     assert str(Location.of("s3://bucket/a@2026-11-01T08:00Z")) == "s3://bucket/a"
 
 
-def test_a_writer_opens_a_table_again_only_for_others_commits(tmp_path, monkeypatch):
+def test_writer_reopens_table_only_after_other_commits(tmp_path, monkeypatch):
     writer, opened = StoreWriter(tmp_path / "s"), []
     open_table = Location.open_table
     monkeypatch.setattr(

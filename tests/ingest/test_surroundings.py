@@ -1,4 +1,4 @@
-"""Lidar scans and plans: clearance, who comes nearer, what is on the way."""
+"""Lidar scans and plans: clearance, approaching objects, and obstacles on the plan."""
 
 from itertools import pairwise
 from typing import Any
@@ -29,8 +29,8 @@ from restock.ingest.task.surroundings import (
 from restock.ingest.task.task import Body, Task
 
 
-def test_the_last_angle_says_what_the_increment_says() -> None:
-    """As of foxglove.LaserScan, which has no increment."""
+def test_last_angle_is_equivalent_to_increment() -> None:
+    """foxglove.LaserScan has no increment."""
     fields = scans([120, 9, 1, 0], [-3.1, 0.0, -3.1, 0.0], seed=3)
     first, step = (
         np.asarray(fields[name], np.float64) for name in ("angle_min", "angle_increment")
@@ -49,7 +49,7 @@ POINT = Body(length_m=1e-9, width_m=1e-9)
 CIRCLE = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 
 
-def test_sectors_go_counter_clockwise_from_straight_behind():
+def test_sectors_are_counter_clockwise_from_behind():
     sectors = SectorMap.build(CIRCLE, 4, POINT)
     ranges = np.full((1, 360), 3.0)
     ranges[0, 180 + 45] = 1.0  # 45 degrees to the left of straight ahead
@@ -57,31 +57,31 @@ def test_sectors_go_counter_clockwise_from_straight_behind():
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_range_that_is_a_signalling_nan_is_a_nan():
+def test_signalling_nan_range_is_treated_as_nan():
     ranges = np.full((1, 360), 3.0, np.float32)
-    ranges.view(np.uint32)[0, :5] = 0x7F800001  # of a damaged message
+    ranges.view(np.uint32)[0, :5] = 0x7F800001  # as in a damaged message
     assert SectorMap.build(CIRCLE, 4, POINT).clearance(ranges, 0.05, 4.0)[0, 0] == pytest.approx(3)
 
 
-def test_a_lidar_that_looks_backward():
+def test_backward_lidar():
     turned = Body(length_m=1e-9, width_m=1e-9, lidar_yaw_rad=np.pi)
     ranges = np.full((1, 360), 3.0)
-    ranges[0, 180] = 1.0  # its zero bearing, which is the robot's back
+    ranges[0, 180] = 1.0  # the lidar's zero bearing, which is behind the robot
     sectors = SectorMap.build(CIRCLE, 4, turned).clearance(ranges, 0.05, 4.0)[0]
     assert sectors.argmin() in (0, 3)
 
 
-@pytest.mark.parametrize("nothing", [np.inf, np.nan, 0.0, 0.049, 4.1, -1.0])
-def test_no_valid_return_counts_as_free(nothing):
+@pytest.mark.parametrize("invalid", [np.inf, np.nan, 0.0, 0.049, 4.1, -1.0])
+def test_invalid_ranges_count_as_free(invalid):
     sectors = SectorMap.build(CIRCLE, 36, BODY)
-    assert (sectors.clearance(np.full((2, 360), nothing), 0.05, 4.0) == 4.0).all()
+    assert (sectors.clearance(np.full((2, 360), invalid), 0.05, 4.0) == 4.0).all()
 
 
 @pytest.mark.parametrize("at_m", [None, (0.0, 0.0), (0.2, 0.15)])
-def test_too_close_to_be_measured_is_no_clearance(at_m: tuple[float, float] | None):
-    """-inf (REP 117), in the sector of its beam: of a lidar in the middle, and of one beside it."""
+def test_minus_infinity_range_is_zero_clearance(at_m: tuple[float, float] | None):
+    """Test -inf (REP 117) in its beam's sector, for a central and an off-centre lidar."""
     ranges = np.full((2, 360), 2.0)
-    ranges[1, 265:275] = -np.inf  # on its left
+    ranges[1, 265:275] = -np.inf  # on the robot's left
     if at_m is None:
         found = SectorMap.build(CIRCLE, 36, BODY).clearance(ranges, 0.3, 4.0)
     else:
@@ -93,7 +93,7 @@ def test_too_close_to_be_measured_is_no_clearance(at_m: tuple[float, float] | No
     assert len(left)
 
 
-def test_a_sector_without_beams_is_free():
+def test_sector_without_beams_is_free():
     front = np.linspace(-0.5, 0.5, 20)
     clearance = SectorMap.build(front, 36, BODY).clearance(np.full((1, 20), 1.0), 0.05, 4.0)[0]
     assert clearance[0] == 4.0
@@ -105,20 +105,20 @@ def test_a_sector_without_beams_is_free():
     st.lists(st.floats(0.05, 4.0), min_size=1, max_size=50),
     st.floats(-3, 3),
 )
-def test_the_smallest_clearance_is_that_of_some_beam(sectors, ranges, first):
+def test_minimum_clearance_equals_minimum_range(sectors, ranges, first):
     bearings = first + np.arange(len(ranges)) * 0.1
     sector_map = SectorMap.build(bearings, sectors, POINT)
     clearance = sector_map.clearance(np.array([ranges]), 0.05, 4.0)[0]
     assert clearance.min() == pytest.approx(min(ranges), abs=1e-6)
     assert len(clearance) == sectors
-    # Each beam's sector is at most as free as the beam.
+    # Each beam's sector has at most the beam's range as clearance.
     sector = ((bearings + np.pi) % (2 * np.pi) * (sectors / (2 * np.pi))).astype(int)
     for beam, range_m in zip(np.minimum(sector, sectors - 1), ranges, strict=True):
         assert clearance[beam] <= range_m + 1e-9
 
 
 @given(st.floats(-7, 7), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(-0.04, 0.04))
-def test_the_reach_ends_on_the_outline(bearing, length, width, lidar_x):
+def test_outline_reach_ends_on_outline(bearing, length, width, lidar_x):
     body = Body(length_m=length, width_m=width, lidar_x_m=lidar_x)
     reach = outline_reach(np.array([bearing]), body)[0]
     x, y = lidar_x + reach * np.cos(bearing), reach * np.sin(bearing)
@@ -160,15 +160,15 @@ def scans(beams: list[int], firsts: list[float], seed: int) -> dict[str, FieldCo
     st.sampled_from([1, 100, 1 << 18]),
     st.integers(0, 99),
 )
-def test_a_scan_by_itself_gives_what_it_gives_among_others(kinds, at, values, seed):
+def test_scan_reduction_does_not_depend_on_batch(kinds, at, values, seed):
     fields = scans([beams for beams, _ in kinds], [first for _, first in kinds], seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(needs, "_VALUES", values)
         whole = REDUCE.apply(fields)
         rows = np.arange(len(kinds))
         parts = [
-            REDUCE.apply({name: take(column, some) for name, column in fields.items()})
-            for some in (rows[:at], rows[at:])
+            REDUCE.apply({name: take(column, part_rows) for name, column in fields.items()})
+            for part_rows in (rows[:at], rows[at:])
         ]
     for name in (SECTORS, BEAMS, BLIND, UNAIMED):
         together = np.concatenate([np.asarray(part[name]) for part in parts])
@@ -181,16 +181,16 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(kinds, at, values, se
             sectors = SectorMap.build(bearings, SHIPPED.sectors, SHIPPED.body)
             ranges = fields["ranges"]
             assert isinstance(ranges, Ragged)
-            one = np.asarray(ranges[row])[None]
-            expected = sectors.clearance(one, SHIPPED.range_min_m, SHIPPED.range_max_m)[0]
-            blind = not (one >= SHIPPED.range_min_m).any()
+            ranges_m = np.asarray(ranges[row])[None]
+            expected = sectors.clearance(ranges_m, SHIPPED.range_min_m, SHIPPED.range_max_m)[0]
+            blind = not (ranges_m >= SHIPPED.range_min_m).any()
         assert np.array_equal(np.asarray(whole[SECTORS])[row], expected)
         assert np.asarray(whole[BEAMS])[row] == beams
         assert np.asarray(whole[BLIND])[row] == blind
         assert np.asarray(whole[UNAIMED])[row] == (beams > 0 and np.isnan(first))
 
 
-def test_an_angle_that_is_no_number_is_named() -> None:
+def test_non_scalar_angle_is_reported() -> None:
     fields = scans([30], [-3.0], 4)
     with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number per message"):
         REDUCE.apply({**fields, "angle_min": fields["ranges"]})
@@ -199,18 +199,20 @@ def test_an_angle_that_is_no_number_is_named() -> None:
 L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
 
 
-def seen(plan, x, y, yaw, distances=(1.0, 2.2)):
-    one = np.ones(1)
-    return view_route(pad_plans([np.asarray(plan, float)]), x * one, y * one, yaw * one, distances)
+def view_of(plan, x, y, yaw, distances=(1.0, 2.2)):
+    ones = np.ones(1)
+    return view_route(
+        pad_plans([np.asarray(plan, float)]), x * ones, y * ones, yaw * ones, distances
+    )
 
 
-def test_look_ahead_goes_round_the_corner():
-    view = seen(L_SHAPE, 3.5, 0.0, 0.0)
+def test_look_ahead_follows_corner_of_plan():
+    view = view_of(L_SHAPE, 3.5, 0.0, 0.0)
     assert view.look_ahead_m[0] == pytest.approx(np.array([[0.5, 0.5], [0.5, 1.7]]))
 
 
-def test_beyond_the_end_is_the_end():
-    view = seen(L_SHAPE, 4.0, 2.5, 0.0)
+def test_look_ahead_stops_at_end_of_plan():
+    view = view_of(L_SHAPE, 4.0, 2.5, 0.0)
     assert view.look_ahead_m[0] == pytest.approx(np.array([[0.0, 0.5], [0.0, 0.5]]))
     assert view.remaining_m == pytest.approx([0.5])
 
@@ -224,21 +226,21 @@ TWICE_AT_THE_ORIGIN = [(7.203125, 0.0), (-1.0, 0.0), (0.0, 2.0**-23), (0.0, 0.0)
 
 @given(st.lists(plans, min_size=1, max_size=4), coordinate, coordinate, st.floats(-4, 4))
 @example([[(0.0, 0.0)] * 6, TWICE_AT_THE_ORIGIN], 0.0, 0.0, 0.0)
-def test_padding_changes_nothing(several, x, y, yaw):
+def test_padding_does_not_change_route_view(several, x, y, yaw):
     count = len(several)
     arrays = [np.asarray(plan, float) for plan in several]
     at = [np.full(count, value) for value in (x, y, yaw)]
     together = view_route(pad_plans(arrays), *at, (1.0, 2.2))
     for index, plan in enumerate(arrays):
-        alone = seen(plan, x, y, yaw)
+        alone = view_of(plan, x, y, yaw)
         assert together.look_ahead_m[index] == pytest.approx(alone.look_ahead_m[0], abs=1e-6)
         assert together.remaining_m[index] == pytest.approx(alone.remaining_m[0], abs=1e-6)
 
 
 @given(plans, coordinate, coordinate, st.floats(-4, 4))
-def test_the_nearest_point_is_the_nearest_and_the_rest_remains(plan, x, y, yaw):
-    view = seen(plan, x, y, yaw, (0.0,))
-    # A look-ahead of nothing is the nearest point itself.
+def test_offset_and_remaining_length_of_plan(plan, x, y, yaw):
+    view = view_of(plan, x, y, yaw, (0.0,))
+    # A look-ahead of zero is the nearest point itself.
     assert np.linalg.norm(view.look_ahead_m[0, 0]) == pytest.approx(view.offset_m[0], abs=1e-6)
     points = np.asarray(plan, float)
     dense = np.concatenate([points[:1]] + [np.linspace(a, b, 60) for a, b in pairwise(points)])
@@ -255,7 +257,7 @@ PERIOD_S = 0.2
 
 
 def scan(pose: tuple[float, float, float], discs: list[Disc], walls_m: float = 6.0) -> Any:
-    """Return the sector clearances (1, K) in a room."""
+    """Return sector clearances (1, K) in a room."""
     ranges = ranges_in_room(BEARINGS, pose, discs, walls_m)
     return SECTOR_MAP.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
 
@@ -270,26 +272,26 @@ def signals(step: int, clearance: Any, forward_m: float, turn_rad: float) -> dic
     }
 
 
-def between(
-    discs: list[Disc], then: list[Disc], forward_m: float = 0.0, turn: float = 0.0
+def approach_m(
+    discs: list[Disc], moved: list[Disc], forward_m: float = 0.0, turn: float = 0.0
 ) -> float:
-    """Return what came nearer while the robot drove an arc and things moved to `then`."""
+    """Return the approach measured while the robot drove an arc and objects moved to `then`."""
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
     before = signals(0, scan((0.0, 0.0, 0.0), discs), forward_m, turn)
-    now = signals(1, scan(pose, then), forward_m, turn)
+    now = signals(1, scan(pose, moved), forward_m, turn)
     return float(came_nearer(TASK, now, [before])[0])
 
 
 @pytest.mark.parametrize("bearing_deg", range(-175, 180, 23))
 @pytest.mark.parametrize("step_m", [0.1, 0.2, 0.3])
-def test_who_walks_toward_a_robot_comes_nearer_by_what_they_walk(bearing_deg, step_m):
-    way = np.array([np.cos(np.radians(bearing_deg)), np.sin(np.radians(bearing_deg))])
-    start, end = ((*(way * far), 0.25) for far in (2.0, 2.0 - step_m))
-    came = between([start], [end], 0.0)
+def test_approach_of_walking_person(bearing_deg, step_m):
+    direction = np.array([np.cos(np.radians(bearing_deg)), np.sin(np.radians(bearing_deg))])
+    start, end = ((*(direction * far), 0.25) for far in (2.0, 2.0 - step_m))
+    came = approach_m([start], [end], 0.0)
     assert step_m - 0.06 < came < step_m + 0.02
-    assert between([start], [start]) == 0
-    assert between([end], [start]) == 0  # goes away
-    assert between([(*(way * 3.4), 0.25)], [(*(way * 3.2), 0.25)]) == 0  # beyond 2 m
+    assert approach_m([start], [start]) == 0
+    assert approach_m([end], [start]) == 0  # moves away
+    assert approach_m([(*(direction * 3.4), 0.25)], [(*(direction * 3.2), 0.25)]) == 0  # beyond 2 m
 
 
 @given(
@@ -301,8 +303,8 @@ def test_who_walks_toward_a_robot_comes_nearer_by_what_they_walk(bearing_deg, st
     st.floats(1.5, 6.0),
 )
 @settings(max_examples=150)
-def test_standing_things_do_not_come_nearer(discs, forward_m, turn, walls):
-    """But for what a sector's breadth leaves open: less than what a walk of .5 m/s adds up to."""
+def test_standing_objects_do_not_approach(discs, forward_m, turn, walls):
+    """Sector width leaves an error below the approach of a person at 0.5 m/s."""
     discs = [disc for disc in discs if np.hypot(disc[0], disc[1]) > disc[2] + 0.5]
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
     before = signals(0, scan((0.0, 0.0, 0.0), discs, walls), forward_m, turn)
@@ -310,39 +312,39 @@ def test_standing_things_do_not_come_nearer(discs, forward_m, turn, walls):
     assert came_nearer(TASK, now, [before])[0] < 0.1
 
 
-def over(scans: list[Any]) -> float:
-    """Return what came nearer at the last of these scans (1, K) of a robot that stands."""
-    *earlier, now = (signals(step, one, 0.0, 0.0) for step, one in enumerate(scans))
+def last_approach_m(scans: list[Any]) -> float:
+    """Return the approach at the last of these scans (1, K) of a standing robot."""
+    *earlier, now = (signals(step, clearance, 0.0, 0.0) for step, clearance in enumerate(scans))
     return float(came_nearer(TASK, now, earlier[::-1])[0])
 
 
-def test_a_flickering_edge_does_not_come_nearer():
-    """Chair legs and the rims of things, with something behind them."""
-    seen, missed = (scan((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], []))
-    assert over([missed, seen]) > 0.2  # of two scans alone it looks so
-    assert over([seen, missed, seen]) == 0
-    assert over([seen, missed, missed, missed, seen]) == 0
+def test_flickering_edge_does_not_approach():
+    """Chair legs and edges flicker against the background."""
+    visible, missed = (scan((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], []))
+    assert last_approach_m([missed, visible]) > 0.2  # two scans alone look like an approach
+    assert last_approach_m([visible, missed, visible]) == 0
+    assert last_approach_m([visible, missed, missed, missed, visible]) == 0
 
 
-def test_who_comes_on_does_so_against_all_that_was_seen_before():
+def test_steady_approach_is_measured_against_all_scans():
     at = [scan((0.0, 0.0, 0.0), [(far, 0.0, 0.25)], 3.0) for far in (2.0, 1.8, 1.6, 1.4, 1.2)]
-    assert over(at) == pytest.approx(0.2, abs=0.06)
+    assert last_approach_m(at) == pytest.approx(0.2, abs=0.06)
 
 
-def test_what_is_suddenly_much_nearer_was_hidden_before():
-    """Behind a corner, or from a beam that was lost: nobody walks a metre in a step."""
+def test_sudden_large_approach_is_ignored():
+    """The object was behind a corner or in a lost beam: nobody walks a metre in one step."""
     empty, near = (scan((0.0, 0.0, 0.0), discs, 2.5) for discs in ([], [(1.2, 0.0, 0.25)]))
-    assert over([empty, empty, near]) == 0
+    assert last_approach_m([empty, empty, near]) == 0
 
 
-def test_where_no_beam_came_back_nothing_is_known():
+def test_sector_without_return_gives_no_approach():
     near = scan((0.0, 0.0, 0.0), [(1.9, 0.0, 0.25)], 3.0)
     lost = np.full_like(near, TASK.range_max_m)
-    assert over([lost, near]) == 0
+    assert last_approach_m([lost, near]) == 0
 
 
-def test_a_slow_lidar_sees_nobody_come():
-    """Its scans are held: the last one is then of where the robot was steps ago."""
+def test_held_scans_give_no_approach():
+    """Held scans show the surroundings of the robot's position some steps earlier."""
     at_m = np.arange(8) * 0.15
     scans = [scan((x, 0.0, 0.0), [(3.0, 0.2, 0.4)]) for x in at_m]
     held = [signals(step, scans[step - step % 2], 0.15, 0.0) for step in range(8)]
@@ -350,30 +352,30 @@ def test_a_slow_lidar_sees_nobody_come():
         assert came_nearer(TASK, held[step], held[:step][::-1])[0] < 0.02
 
 
-def test_a_return_on_the_plan_is_found():
+def test_return_on_plan_is_found():
     near, far = np.array([1.0, 0.0]), np.array([1.8, 0.9])  # a plan that bends left
     at_m = np.array(plan_distances_m(TASK))[:, None]
     beyond = (at_m - TASK.near_m) / (TASK.far_m - TASK.near_m)
     plan = np.where(at_m <= TASK.near_m, at_m * near, near + beyond * (far - near))[None]
 
-    def seen(discs: list[Disc]) -> tuple[float, float]:
-        way_m, gap_m = returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)
-        return float(way_m[0]), float(gap_m[0])
+    def distance_and_gap(discs: list[Disc]) -> tuple[float, float]:
+        distance_m, gap_m = returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)
+        return float(distance_m[0]), float(gap_m[0])
 
-    def way(discs: list[Disc]) -> float:
-        return seen(discs)[0]
+    def distance(discs: list[Disc]) -> float:
+        return distance_and_gap(discs)[0]
 
-    assert way([]) == TASK.range_max_m
-    assert way([(1.0, 0.0, 0.2)]) == pytest.approx(0.8, abs=0.05)
-    assert way([(1.6, 0.68, 0.2)]) == pytest.approx(1.0 + 0.9 - 0.2, abs=0.15)
-    assert way([(2.0, -0.3, 0.2)]) == TASK.range_max_m  # straight on, where the plan does not go
-    assert way([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside it
+    assert distance([]) == TASK.range_max_m
+    assert distance([(1.0, 0.0, 0.2)]) == pytest.approx(0.8, abs=0.05)
+    assert distance([(1.6, 0.68, 0.2)]) == pytest.approx(1.0 + 0.9 - 0.2, abs=0.15)
+    assert distance([(2.0, -0.3, 0.2)]) == TASK.range_max_m  # straight ahead, off the plan
+    assert distance([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside the plan
     free = msgspec.structs.replace(TASK, goal="none")
     ahead = scan((0.0, 0.0, 0.0), [(1.0, 0.0, 0.2)])
-    assert [one[0] for one in returns_on_plan(free, ahead, plan)] == [TASK.range_max_m] * 2
+    assert [values[0] for values in returns_on_plan(free, ahead, plan)] == [TASK.range_max_m] * 2
 
 
-def test_the_gap_is_to_the_nearest_beside_the_plan():
+def test_gap_is_to_nearest_return_beside_plan():
     plan = np.stack([np.array(plan_distances_m(TASK)), np.zeros(7)], axis=-1)[None]
 
     def gap(discs: list[Disc]) -> float:
@@ -383,4 +385,4 @@ def test_the_gap_is_to_the_nearest_beside_the_plan():
     assert gap([(0.9, 0.0, 0.2)]) == pytest.approx(0.0, abs=0.1)
     assert gap([(0.9, 0.8, 0.3)]) == pytest.approx(0.5, abs=0.1)
     assert gap([(0.9, -0.8, 0.3), (0.9, 0.6, 0.2)]) == pytest.approx(0.4, abs=0.1)
-    assert gap([(2.0, 0.0, 0.2)]) == TASK.range_max_m  # farther on
+    assert gap([(2.0, 0.0, 0.2)]) == TASK.range_max_m  # beyond the considered length
