@@ -1,4 +1,4 @@
-"""A task's own SQL, of reward and observation: on logs, in the twin, and what is refused."""
+"""A task's own SQL for reward and observation: on logs, in the twin, and rejected SQL."""
 
 import re
 from pathlib import Path
@@ -42,7 +42,7 @@ unit = "V"
 
 
 def ingested(folder: Path, more: str) -> Store:
-    """Return the store of a shipped recording by the shipped profile and `more`."""
+    """Ingest a shipped recording with the shipped profile plus `more`, and open the store."""
     (folder / "own.toml").write_text(WAREHOUSE + more)
     tuesday, profile = ROOT / "sample_logs" / "amr_tuesday", folder / "own.toml"
     to = ["--profile", str(profile), "--store", str(folder / "store")]
@@ -62,26 +62,27 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
         return store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
 
 
-def test_terms_are_paid_by_the_step_that_a_transition_leads_to(plain, rows):
+def test_reward_terms_use_the_next_step(plain, rows):
     differ = {name for name in rows.column_names if not rows[name].equals(plain[name])}
     assert differ - {"ingest_id", "source_file"} == {
         *("reward", "task_hash", "profile_hash"),
-        *("observation", "next_observation"),  # which the entries end
+        *("observation", "next_observation"),  # own entries are appended
     }
-    paid = rows["reward"].to_numpy() - plain["reward"].to_numpy()
+    added = rows["reward"].to_numpy() - plain["reward"].to_numpy()
     step, speed, near, turn = (
         rows[name].to_numpy()
         for name in ("step_index", "wheel_speed_mps", "clearance_m", "gyro_yaw_rate_radps")
     )
-    inside = np.flatnonzero(step[1:] == step[:-1] + 1)  # the step after is a row, too
+    inside = np.flatnonzero(step[1:] == step[:-1] + 1)  # the next step is a row, too
     expected = -0.5 * ((near < 0.3) & (speed > 0.4))[inside + 1]
     swerve = 0.2 * np.abs(turn[inside + 1] - turn[inside - 1])
-    expected -= np.where(step[inside] > 0, swerve, 0.0)  # two steps back is before the episode
-    np.testing.assert_allclose(paid[inside], expected, atol=1e-6)
+    # two steps back is before the start of the episode
+    expected -= np.where(step[inside] > 0, swerve, 0.0)
+    np.testing.assert_allclose(added[inside], expected, atol=1e-6)
     assert len(np.unique(expected.round(1))) > 3
 
 
-def test_entries_of_ones_own_end_the_observation(plain, rows):
+def test_own_entries_are_appended_to_observation(plain, rows):
     observed, following, shipped = (
         np.stack(table[name].to_numpy())
         for table, name in (
@@ -101,22 +102,22 @@ def test_entries_of_ones_own_end_the_observation(plain, rows):
     np.testing.assert_allclose(observed[inside, -3:], expected, atol=1e-6)
     inside = np.flatnonzero(step[1:] == step[:-1] + 1)
     np.testing.assert_array_equal(observed[inside + 1], following[inside])
-    # The goal is that of the episode, in its last observation, too.
+    # The last observation of an episode has the goal of that episode, too.
     ends = np.flatnonzero(rows["terminated"].to_numpy() & ~rows["bumped"].to_numpy())
     assert (following[ends, -1] <= load_profile("warehouse_amr").task.goal_radius_m).any()
 
 
-def test_a_term_on_a_custom_signal_is_paid_on_logs_alone(plain, tmp_path):
+def test_reward_term_on_custom_signal_works_only_on_logs(plain, tmp_path):
     with ingested(tmp_path, BATTERY) as store:
         rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
-    paid = (rows["reward"].to_numpy() - plain["reward"].to_numpy()).round(5)
-    assert set(paid.tolist()) == {0.0, -1.0}
+    added = (rows["reward"].to_numpy() - plain["reward"].to_numpy()).round(5)
+    assert set(added.tolist()) == {0.0, -1.0}
     task = load_profile(tmp_path / "own.toml").task
     with pytest.raises(ConfigError, match=r"reward_terms.low.*battery_v.*the twin does not fill"):
         WarehouseVectorEnv(1, task=task)
 
 
-def drive(task: Task, steps: int, state: dict | None = None):
+def drive_twin(task: Task, steps: int, state: dict | None = None):
     """Return rewards (steps, 2), observations, signals before and after each, and a state."""
     env, rng = WarehouseVectorEnv(2, task=task, seed=3), np.random.default_rng(0)
     on_the_spot = [place for place, (speed, _) in enumerate(task.actions) if not speed]
@@ -136,14 +137,17 @@ def drive(task: Task, steps: int, state: dict | None = None):
     return np.array(rewards), np.array(observations), signals, middle
 
 
-def test_the_twin_does_as_ingest_would_and_resumes_to_the_bit():
+def test_twin_matches_ingest_and_resumes_exactly():
     own = parse_profile(WAREHOUSE + TERMS + ENTRIES, where="own.toml").task
-    rewards, observations, signals, middle = drive(own, 24)
-    plain_rewards, plain_observations, _, _ = drive(load_profile("warehouse_amr").task, 24)
+    rewards, observations, signals, middle = drive_twin(own, 24)
+    plain_rewards, plain_observations, _, _ = drive_twin(load_profile("warehouse_amr").task, 24)
     np.testing.assert_array_equal(observations[..., :-3], plain_observations)
     for robot in range(2):
         keys = {"episode_index": np.zeros(25, np.int64), "step_index": np.arange(25)}
-        now = {s.name: np.array([one[s.name][robot] for one in signals]) for s in STORED_SIGNALS}
+        now = {
+            s.name: np.array([step_signals[s.name][robot] for step_signals in signals])
+            for s in STORED_SIGNALS
+        }
         logged = pa.table(keys | now).cast(steps_schema())
         expected = own_reward(own, logged)[1:]
         np.testing.assert_array_equal(rewards[:, robot], plain_rewards[:, robot] + expected)
@@ -151,16 +155,16 @@ def test_the_twin_does_as_ingest_would_and_resumes_to_the_bit():
         entries = observed_in_log(own, now, np.arange(25) > 0)
         np.testing.assert_array_equal(observations[:, robot, -3:], entries)
         assert np.count_nonzero(entries) > 50
-        # Neither changes with what comes after.
+        # Neither depends on later steps.
         np.testing.assert_array_equal(own_reward(own, logged[:9])[1:], expected[:8])
         early = {name: column[:9] for name, column in now.items()}
         np.testing.assert_array_equal(observed_in_log(own, early, np.arange(9) > 0), entries[:9])
-    resumed = drive(own, 24, middle)
+    resumed = drive_twin(own, 24, middle)
     np.testing.assert_array_equal(resumed[0], rewards[12:])
     np.testing.assert_array_equal(resumed[1][1:], observations[13:])
 
 
-def test_without_terms_nothing_changes_and_each_word_counts():
+def test_own_sql_changes_task_hash():
     plain = load_profile("warehouse_amr")
     own = parse_profile(WAREHOUSE + TERMS + ENTRIES, where="own.toml")
     assert not re.search("reward_terms|observed", profile_toml(plain))
@@ -172,7 +176,7 @@ def test_without_terms_nothing_changes_and_each_word_counts():
     assert len(hashes) == 3
 
 
-REFUSED = [
+INVALID_SQL = [
     ("reward_terms", 'x = [1, "lead(clearance_m) OVER episode"]', "may look at later steps"),
     ("reward_terms", 'x = [1, "clearence_m < 1"]', 'Referenced column "clearence_m" not found'),
     ("reward_terms", "x = [1, \"'much'\"]", "its SQL gives VARCHAR, not a number"),
@@ -191,15 +195,15 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("table", "given", "what"), REFUSED)
-def test_sql_that_cannot_be_is_refused_by_name(table, given, what):
-    with pytest.raises(ConfigError) as refused:
-        parse_profile(f"{WAREHOUSE}\n[task.{table}]\n{given}\n", where="own.toml")
-    assert what in str(refused.value)
-    assert table in str(refused.value)
+@pytest.mark.parametrize(("table", "line", "message"), INVALID_SQL)
+def test_invalid_task_sql_is_rejected_with_its_key(table, line, message):
+    with pytest.raises(ConfigError) as error:
+        parse_profile(f"{WAREHOUSE}\n[task.{table}]\n{line}\n", where="own.toml")
+    assert message in str(error.value)
+    assert table in str(error.value)
 
 
-def test_what_a_task_observes_of_its_own_is_not_mirrored():
+def test_own_entries_cannot_be_mirrored():
     own = parse_profile(WAREHOUSE + ENTRIES, where="own.toml").task
     with pytest.raises(ValueError, match="mirror image"):
         Mirror.of(own)
@@ -213,18 +217,18 @@ HINDSIGHT = WAREHOUSE.replace("[clock]", '[goal]\nsource = "hindsight"\n\n[clock
 
 
 @pytest.mark.parametrize(
-    ("text", "sql", "what"),
+    ("text", "sql", "message"),
     [
         (without(WAREHOUSE, "scan"), "coalesce(clearance_m, 9)", "there is no lidar"),
         (without(HINDSIGHT, "goal", "plan"), "plan_gap_m", "the path that was driven"),
     ],
 )
-def test_a_term_on_what_is_unknown_is_refused(text, sql, what):
-    with pytest.raises(ConfigError, match=what):
+def test_reward_term_on_unknown_signal_is_rejected(text, sql, message):
+    with pytest.raises(ConfigError, match=message):
         parse_profile(f'{text}\n[task.reward_terms]\nx = [1, "{sql}"]\n', where="own.toml")
 
 
-def test_a_term_that_pays_without_bound_is_refused():
+def test_unbounded_reward_term_is_rejected():
     task = parse_profile(f'{WAREHOUSE}\n[task.reward_terms]\nx = [1, "exp(710)"]\n', where="").task
     steps = pa.table({name: [0] for name in ("episode_index", "step_index")})
     with pytest.raises(ConfigError, match="it is inf at a step"):

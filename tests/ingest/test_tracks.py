@@ -1,4 +1,4 @@
-"""Tracks of who moves: round things in a square room, seen by a driving robot's lidar."""
+"""Tracks of moving objects: discs in a square room, seen by a driving robot's lidar."""
 
 from collections.abc import Callable
 
@@ -43,7 +43,7 @@ def steps(
     seed: int = 0,
     walls_m: float = 4.5,
 ) -> list[tuple[Signals, Array, NDArray[np.int64]]]:
-    """Return a drive's steps: signals, scans and when these were measured; `discs` by the time."""
+    """Return a drive's steps: signals, scans and scan stamps; `discs` is a function of time."""
     rng, pose, made = np.random.default_rng(seed), [-2.0, 0.0, 0.0], []
     for step in range(count):
         stamp_ns = np.array([round((step + 1) * PERIOD_S * 1e9)])
@@ -64,8 +64,8 @@ def steps(
     return made
 
 
-def tracked(drive: list[tuple[Signals, Array, NDArray[np.int64]]]) -> dict[str, Array]:
-    """Return the tracks of every step, (T, K)."""
+def track_drive(drive: list[tuple[Signals, Array, NDArray[np.int64]]]) -> dict[str, Array]:
+    """Return the tracks (T, K) of every step."""
     tracker = Tracker(TASK)
     rows = [tracker.begin(np.array([0]), *drive[0])]
     rows += [tracker.update(*step) for step in drive[1:]]
@@ -73,22 +73,22 @@ def tracked(drive: list[tuple[Signals, Array, NDArray[np.int64]]]) -> dict[str, 
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.0, 0.0), (0.4, 0.0), (0.2, 0.3)])
-@pytest.mark.parametrize("way", [(0.0, 0.9), (-0.8, 0.1), (0.7, -0.7)])
-def test_who_walks_is_tracked_with_place_and_speed(way, speed, turn):
-    start = np.array([0.2, -1.0 if way[1] > 0 else 0.8])
+@pytest.mark.parametrize("velocity_mps", [(0.0, 0.9), (-0.8, 0.1), (0.7, -0.7)])
+def test_walking_person_is_tracked_with_position_and_speed(velocity_mps, speed, turn):
+    start = np.array([0.2, -1.0 if velocity_mps[1] > 0 else 0.8])
 
     def walker(at_s: float) -> list[Disc]:
-        x, y = start + np.array(way) * at_s
+        x, y = start + np.array(velocity_mps) * at_s
         return [(x, y, 0.25), (1.0, 2.5, 0.4), (-3.0, -1.5, 0.3)]
 
     count = 12
-    found = tracked(steps(count, walker, speed, turn))
+    found = track_drive(steps(count, walker, speed, turn))
     known = np.isfinite(found["track_x_m"])
     assert known[-1].tolist() == [True, False, False]
     yaw = turn * PERIOD_S * (count - 1)
     cos, sin = np.cos(yaw), np.sin(yaw)
     vx, vy = found["track_vx_mps"][-1, 0], found["track_vy_mps"][-1, 0]
-    assert [cos * vx - sin * vy, sin * vx + cos * vy] == pytest.approx(way, abs=0.2)
+    assert [cos * vx - sin * vy, sin * vx + cos * vy] == pytest.approx(velocity_mps, abs=0.2)
     if not speed:
         x, y = walker((count - 1) * PERIOD_S)[0][:2]
         assert found["track_x_m"][-1, 0] - 2.0 == pytest.approx(x, abs=0.15)
@@ -105,14 +105,14 @@ def test_who_walks_is_tracked_with_place_and_speed(way, speed, turn):
         st.tuples(st.floats(-0.5, 3.5), st.floats(-3.5, 3.5), st.floats(0.15, 0.6)), max_size=4
     ),
 )
-def test_nothing_moves_but_the_robot(seed, speed, turn, discs):
+def test_static_scene_gives_no_tracks(seed, speed, turn, discs):
     clear = [disc for disc in discs if abs(disc[1]) > 1.2 or speed == 0]
-    found = tracked(steps(15, lambda at_s: clear, speed, turn, seed=seed))
+    found = track_drive(steps(15, lambda at_s: clear, speed, turn, seed=seed))
     assert not np.isfinite(found["track_x_m"]).any()
 
 
-def test_who_stops_is_tracked_for_a_while_and_then_dropped():
-    found = tracked(steps(40, lambda at_s: [(0.0, min(at_s, 1.6) - 1.0, 0.25)]))
+def test_stopped_person_is_tracked_briefly_then_dropped():
+    found = track_drive(steps(40, lambda at_s: [(0.0, min(at_s, 1.6) - 1.0, 0.25)]))
     known = np.isfinite(found["track_x_m"]).any(axis=1)
     speed = np.hypot(found["track_vx_mps"], found["track_vy_mps"])[:, 0]
     assert known[8:16].all()
@@ -120,16 +120,16 @@ def test_who_stops_is_tracked_for_a_while_and_then_dropped():
     assert not known[-5:].any()
 
 
-def test_what_comes_later_changes_no_earlier_track():
+def test_tracks_do_not_depend_on_later_steps():
     walk = steps(20, lambda at_s: [(0.0, at_s - 1.5, 0.25)])
     other = walk[:12] + steps(20, lambda at_s: [(1.0, 1.0 - at_s, 0.5)], seed=1)[12:]
-    whole, changed = tracked(walk), tracked(other)
-    for name, values in tracked(walk[:12]).items():
+    whole, changed = track_drive(walk), track_drive(other)
+    for name, values in track_drive(walk[:12]).items():
         np.testing.assert_array_equal(values, whole[name][:12])
         np.testing.assert_array_equal(values, changed[name][:12])
 
 
-def test_many_robots_are_tracked_as_each_alone():
+def test_several_robots_are_tracked_independently():
     drives = [
         steps(20, lambda at_s, way=way: [(0.3, way * (at_s - 1.5), 0.25)], 0.1 * index, seed=index)
         for index, way in enumerate((1.0, -0.8, 0.0))
@@ -144,22 +144,23 @@ def test_many_robots_are_tracked_as_each_alone():
     found = [tracker.begin(np.arange(3), *together(0))]
     found += [tracker.update(*together(step)) for step in range(1, 20)]
     for robot, drive in enumerate(drives):
-        for name, values in tracked(drive).items():
+        for name, values in track_drive(drive).items():
             np.testing.assert_array_equal(np.stack([row[name][robot] for row in found]), values)
 
 
-def test_the_same_scan_again_is_no_new_evidence():
+def test_repeated_scan_is_not_counted_twice():
     once = steps(24, lambda at_s: [(0.0, at_s - 1.5, 0.25)])
     slow = [(now, *once[step - step % 2][1:]) for step, (now, _, _) in enumerate(once)]
-    found = tracked(slow)
+    found = track_drive(slow)
     known = np.flatnonzero(np.isfinite(found["track_x_m"][:, 0]))
     assert len(known) > 8
     y, vy = found["track_y_m"][known[-1], 0], found["track_vy_mps"][known[-1], 0]
     assert vy == pytest.approx(1.0, abs=0.25)
-    assert y == pytest.approx(known[-1] * PERIOD_S - 1.5, abs=0.25)  # where it is at the step
+    # position at the time of the step
+    assert y == pytest.approx(known[-1] * PERIOD_S - 1.5, abs=0.25)
 
 
-def test_a_lidar_off_the_middle_sees_the_same_places():
+def test_off_centre_lidar_gives_same_positions():
     off = Lidar(BEARINGS, from_m=(0.3, -0.1))
     far = np.full((1, 180), np.inf)
     far[0, 90] = 1.0
@@ -167,7 +168,7 @@ def test_a_lidar_off_the_middle_sees_the_same_places():
     assert off.scan(far, 0.05)[0, sector] == pytest.approx(1.3, abs=0.02)
 
 
-def test_tracks_are_the_last_entries_of_an_observation():
+def test_tracks_are_last_entries_of_observation():
     plain = msgspec.structs.replace(TASK, tracks=msgspec.UNSET)
     assert TASK.observation_names[: plain.observation_size] == plain.observation_names
     assert len(TASK.observation_names) == TASK.observation_size
@@ -183,7 +184,7 @@ def test_tracks_are_the_last_entries_of_an_observation():
     assert mirror[:, 0].tolist() == [1, -1, 1, -1, 1, 1]
 
 
-def test_a_profile_without_tracks_is_written_as_before():
+def test_profile_without_tracks_omits_the_key():
     profile = load_profile("warehouse_amr")
     assert "tracks" not in profile_toml(profile)
     assert b"tracks" not in msgspec.json.encode(profile.task)
@@ -192,13 +193,13 @@ def test_a_profile_without_tracks_is_written_as_before():
 TRACKING = WAREHOUSE.replace("[task]\n", "[task]\ntracks = 2\n")
 
 
-def test_a_recording_is_tracked_at_every_step():
+def test_recording_has_tracks_at_every_step():
     profile = parse_profile(TRACKING, where="tracking.toml")
     steps = steps_of(profile, Drive().topics())
     assert all(steps.signals[name].shape == (len(steps), 2) for name in TRACK_SIGNALS)
 
 
-def test_tracks_without_a_lidar_are_refused():
+def test_tracks_without_lidar_are_rejected():
     start = TRACKING.index("[inputs.scan]")
     blind = TRACKING[:start] + TRACKING[TRACKING.index("[inputs.", start + 1) :]
     with pytest.raises(ConfigError, match="asks for tracks, which are made from lidar scans"):

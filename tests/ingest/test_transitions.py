@@ -1,4 +1,4 @@
-"""Transition rows: what is in each, against the contract and by hand."""
+"""Transition rows: their contents against the schema and hand values."""
 
 import msgspec
 import numpy as np
@@ -30,7 +30,7 @@ def vectors(table: pa.Table, name: str) -> np.ndarray:
     return column.flatten().to_numpy().reshape(len(table), -1)
 
 
-def test_the_rows_have_the_schema_of_the_store():
+def test_rows_have_the_store_schema():
     table = rows_of(Drive().topics())
     assert table.schema.equals(transition_schema(TASK.observation_size))
     assert len(table) == 29
@@ -39,22 +39,22 @@ def test_the_rows_have_the_schema_of_the_store():
             assert table[field.name].null_count == 0, field.name
 
 
-def test_next_observation_is_the_observation_of_the_next_row():
+def test_next_observation_equals_that_of_next_row():
     drive = Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)])
     table = rows_of(drive.topics())
-    now, after = vectors(table, "observation"), vectors(table, "next_observation")
+    before, after = vectors(table, "observation"), vectors(table, "next_observation")
     same = np.array(table["episode_index"])[1:] == np.array(table["episode_index"])[:-1]
     assert same.sum() == 27
-    assert np.array_equal(after[:-1][same], now[1:][same])
-    # Across the goals it is not: the old episode ends seen with the old goal.
-    assert not np.array_equal(after[:-1][~same], now[1:][~same])
+    assert np.array_equal(after[:-1][same], before[1:][same])
+    # Not across goals: the old episode ends with an observation of the old goal.
+    assert not np.array_equal(after[:-1][~same], before[1:][~same])
     distance = TASK.observation_names.index("goal_distance")
     assert after[15, distance] == pytest.approx(0.04, abs=0.001)
-    assert now[16, distance] == pytest.approx(0.84, abs=0.001)
+    assert before[16, distance] == pytest.approx(0.84, abs=0.001)
 
 
-def test_progress_is_along_the_plan_when_acting():
-    """A new, longer plan to the same goal is no loss of progress."""
+def test_progress_follows_plan_of_the_action():
+    """A new, longer plan to the same goal is not a loss of progress."""
     topics = Drive().topics()
     x, y = (topics["/plan"].fields[f"poses[].pose.position.{axis}"] for axis in "xy")
     detour_x = [np.array([1.0, 2.0]), np.array([1.0, 2.0]), np.array([11.0, 11.0])]
@@ -71,7 +71,7 @@ def test_progress_is_along_the_plan_when_acting():
     assert len(set(table["episode_index"].to_pylist())) == 1
 
 
-def test_ids_outlive_a_new_profile():
+def test_transition_ids_do_not_depend_on_profile():
     topics = Drive().topics()
     whole = rows_of(topics)["transition_id"].to_numpy()
     assert (whole >> STEP_BITS == int("fedcba9876543210", 16) >> 26).all()
@@ -82,7 +82,7 @@ def test_ids_outlive_a_new_profile():
     assert np.array_equal(again["transition_id"].to_numpy(), whole)
 
 
-def test_labels_zone_policy_and_truth():
+def test_labels_zone_driver_and_truth_columns():
     drive = Drive(duration_s=4.0, truth="wheel_slip", policies=[(0, '{"policy": "p"}')])
     topics = drive.topics()
     slipping = slice(100, 150)  # wheels at twice the speed from 2 s to 3 s
@@ -97,21 +97,21 @@ def test_labels_zone_policy_and_truth():
     assert set(named[~slip]) == {"nominal"}
     assert set(table["true_condition"].to_pylist()) == {"wheel_slip"}
     assert set(table["behaviour_policy"].to_pylist()) == {"p"}
-    assert table["zone"].to_pylist()[:11] == ["cross_west"] * 11  # up to x = 2.1
+    assert table["zone"].to_pylist()[:11] == ["cross_west"] * 11  # up to x = 2.1 m
     assert set(table["zone"].to_pylist()[13:]) == {"aisle_1_west"}
 
 
-def test_conditions_see_an_episodes_last_step():
+def test_conditions_use_the_last_step_of_an_episode():
     topics = Drive(goals=[(0.0, 3.0, 1.0)]).topics()
     time = (topics["/scan"].log_time_ns - START_NS) * 1e-9
-    late = np.repeat(time > 3.15, 72)  # only the episode's end, at 3.2 s, has the obstacle
+    late = np.repeat(time > 3.15, 72)  # only the end of the episode, at 3.2 s, has the obstacle
     topics["/scan"].fields["ranges"].values[late] = 0.4
     table = rows_of(topics)
     near = ["near_collision" in names for names in table["conditions"].to_pylist()]
     assert near == [False] * 15 + [True]
 
 
-def test_without_a_goal_progress_is_forward_displacement():
+def test_progress_without_goal_is_forward_displacement():
     profile = msgspec.structs.replace(
         PROFILE, task=msgspec.structs.replace(TASK, goal="none", control_period_s=0.2)
     )
@@ -124,7 +124,7 @@ def test_without_a_goal_progress_is_forward_displacement():
 
 
 @pytest.mark.parametrize("goal", ["route", "none"])
-def test_observations_are_finite_whatever_the_sensors_say(goal):
+def test_observations_are_finite_for_any_sensor_values(goal):
     rng = np.random.default_rng(0)
     profile = msgspec.structs.replace(PROFILE, task=msgspec.structs.replace(TASK, goal=goal))
     topics = Drive().topics()
@@ -144,8 +144,8 @@ def test_observations_are_finite_whatever_the_sensors_say(goal):
         assert np.isfinite(table[name].to_numpy()).all()
 
 
-def test_the_previous_action_is_known_where_the_robot_drove_on():
-    """At the time limit a new episode starts while driving: it does not start from a stop."""
+def test_previous_action_is_kept_across_time_limit():
+    """At the time limit a new episode starts while driving, not from a stop."""
     profile = msgspec.structs.replace(
         PROFILE, task=msgspec.structs.replace(TASK, time_limit_steps=10)
     )
@@ -157,7 +157,7 @@ def test_the_previous_action_is_known_where_the_robot_drove_on():
     assert observation[10, names.index("previous_action_1")] == 1
 
 
-def test_a_recording_without_usable_steps_gives_no_rows():
+def test_recording_without_usable_steps_gives_no_rows():
     topics = Drive().topics()
     topics["/scan"] = without(topics["/scan"], np.zeros(60, np.bool_))
     table = rows_of(topics)

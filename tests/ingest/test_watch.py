@@ -1,4 +1,4 @@
-"""A watched folder: what is taken, and when; and a process that is killed and started again."""
+"""Watched folders: which files are ingested and when; killing and restarting the process."""
 
 import json
 import os
@@ -25,7 +25,7 @@ FULL = RecordingError("cannot be read or written: No space left on device")
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a bag whose files are named as rosbag2 names them."""
+    """Return a bag whose files have the names that rosbag2 gives them."""
     folder = write_bag(Drive(), tmp_path_factory.mktemp("made") / "bag", storage="mcap")
     (folder / "bag.mcap").rename(folder / "bag_0.mcap")
     metadata = (folder / METADATA).read_text()
@@ -33,13 +33,13 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Seen:
-    """Looks at a folder as a watch does, at times of the test's own."""
+class FakeWatch:
+    """Watch of a folder at times that the test chooses."""
 
     def __init__(self, folder: Path, **options: bool) -> None:
         self.arrivals, self.now_s = Arrivals([str(folder)], **options), 0.0
 
-    def after(self, wait_s: float) -> list[str]:
+    def complete_after(self, wait_s: float) -> list[str]:
         self.now_s += wait_s
         return [path.name for path in self.arrivals.complete(self.now_s)]
 
@@ -51,86 +51,86 @@ class Seen:
         return [(event, why) for event, _, why in self.arrivals.news]
 
 
-def test_a_file_is_taken_once_its_upload_ended(bag, tmp_path):
+def test_file_is_ingested_after_its_upload(bag, tmp_path):
     (file,) = bag.glob("*.mcap")
-    upload, seen = tmp_path / "run.mcap", Seen(tmp_path)
+    upload, watch_ = tmp_path / "run.mcap", FakeWatch(tmp_path)
     upload.write_bytes(file.read_bytes()[:-1000])
-    assert seen.after(0) == seen.after(STILL_S - 1) == []
-    assert seen.after(1) == []
-    assert seen.news == [("waiting", "run.mcap has no MCAP footer yet")]
-    assert (seen.after(60), seen.news) == ([], [])  # said once
+    assert watch_.after(0) == watch_.after(STILL_S - 1) == []
+    assert watch_.after(1) == []
+    assert watch_.news == [("waiting", "run.mcap has no MCAP footer yet")]
+    assert (watch_.after(60), watch_.news) == ([], [])  # reported once
     upload.write_bytes(file.read_bytes())
-    assert seen.after(0) == []
-    assert seen.after(STILL_S) == ["run.mcap"]
-    seen.take(upload)
-    assert seen.after(1000) == []
+    assert watch_.after(0) == []
+    assert watch_.after(STILL_S) == ["run.mcap"]
+    watch_.take(upload)
+    assert watch_.after(1000) == []
 
 
-def test_a_bag_is_taken_once_its_metadata_is_there(bag, tmp_path):
-    arrived, seen = tmp_path / "bag", Seen(tmp_path)
+def test_bag_is_ingested_once_its_metadata_exists(bag, tmp_path):
+    arrived, watch_ = tmp_path / "bag", FakeWatch(tmp_path)
     arrived.mkdir()
     shutil.copy(bag / METADATA, arrived)
-    seen.after(0)
-    assert seen.after(STILL_S) == []
-    ((event, why),) = seen.news
+    watch_.after(0)
+    assert watch_.after(STILL_S) == []
+    ((event, why),) = watch_.news
     assert event == "waiting"
     assert why.startswith(f"{METADATA} lists ")
     (file,) = bag.glob("*.mcap")
     shutil.copy(file, arrived)
     (arrived / METADATA).unlink()
-    seen.after(0)
-    assert seen.after(STILL_S) == []
-    assert seen.news == [("waiting", f"no {METADATA} yet")]
+    watch_.after(0)
+    assert watch_.after(STILL_S) == []
+    assert watch_.news == [("waiting", f"no {METADATA} yet")]
     shutil.copy(bag / METADATA, arrived)
-    seen.after(0)
-    assert seen.after(STILL_S) == ["bag"]
+    watch_.after(0)
+    assert watch_.after(STILL_S) == ["bag"]
 
 
-def test_what_stays_unfinished_is_taken_only_with_salvage(bag, tmp_path):
+def test_unfinished_file_is_ingested_only_with_salvage(bag, tmp_path):
     (file,) = bag.glob("*.mcap")
     (tmp_path / "run.mcap").write_bytes(file.read_bytes()[:-1000])
     for salvage in (False, True):
-        seen = Seen(tmp_path, salvage=salvage)
-        assert seen.after(0) == seen.after(STILL_S) == []
-        assert seen.after(SALVAGE_AFTER_S) == ["run.mcap"] * salvage
+        watch_ = FakeWatch(tmp_path, salvage=salvage)
+        assert watch_.after(0) == watch_.after(STILL_S) == []
+        assert watch_.after(SALVAGE_AFTER_S) == ["run.mcap"] * salvage
 
 
 @pytest.mark.parametrize(
-    ("error", "again"),
+    ("error", "is_retried"),
     [(FULL, True), (StoreError("out of reach"), True), (RecordingError("does not fit"), False)],
     ids=lambda value: str(getattr(value, "what", value)),
 )
-def test_only_failures_that_may_pass_are_tried_again(error, again, bag, tmp_path):
+def test_only_temporary_failures_are_retried(error, is_retried, bag, tmp_path):
     shutil.copytree(bag, tmp_path / "bag")
-    seen = Seen(tmp_path)
-    seen.after(0)
-    assert seen.after(STILL_S) == ["bag"]
-    assert seen.take(tmp_path / "bag", error)
-    assert seen.after(RETRY_S - 1) == []
-    assert seen.after(1) == ["bag"] * again
-    assert not seen.take(tmp_path / "bag", error)  # said once
-    os.utime(tmp_path / "bag" / METADATA, (1, 1))  # it was uploaded again
-    seen.after(0)
-    assert seen.after(STILL_S) == ["bag"]
+    watch_ = FakeWatch(tmp_path)
+    watch_.after(0)
+    assert watch_.after(STILL_S) == ["bag"]
+    assert watch_.take(tmp_path / "bag", error)
+    assert watch_.after(RETRY_S - 1) == []
+    assert watch_.after(1) == ["bag"] * is_retried
+    assert not watch_.take(tmp_path / "bag", error)  # reported once
+    os.utime(tmp_path / "bag" / METADATA, (1, 1))  # as if uploaded again
+    watch_.after(0)
+    assert watch_.after(STILL_S) == ["bag"]
 
 
-def test_a_folder_that_disappears_is_named_once_and_known_again(bag, tmp_path):
+def test_disappeared_folder_is_reported_and_recognised_later(bag, tmp_path):
     folder = tmp_path / "in"
     shutil.copytree(bag, folder / "bag")
-    seen = Seen(folder)
-    seen.after(0)
-    seen.after(STILL_S)
-    seen.take(folder / "bag")
+    watch_ = FakeWatch(folder)
+    watch_.after(0)
+    watch_.after(STILL_S)
+    watch_.take(folder / "bag")
     folder.rename(tmp_path / "away")
-    assert (seen.after(1), seen.news) == ([], [("gone", "")])
-    assert (seen.after(1), seen.news) == ([], [])
+    assert (watch_.after(1), watch_.news) == ([], [("gone", "")])
+    assert (watch_.after(1), watch_.news) == ([], [])
     (tmp_path / "away").rename(folder)
-    assert (seen.after(1), seen.news) == ([], [("back", "")])
-    assert seen.after(STILL_S) == []
+    assert (watch_.after(1), watch_.news) == ([], [("back", "")])
+    assert watch_.after(STILL_S) == []
 
 
 WATCH = """
-__file__ = "watch"  # without it DuckDB takes this for a prompt, and draws bars for slow queries
+__file__ = "watch"  # without it DuckDB assumes a prompt and draws progress bars
 import sys
 from restock.cli import main
 from restock.cli.data import watch
@@ -139,8 +139,8 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-class Process:
-    """A `restock ingest FOLDER --watch` of its own."""
+class WatchProcess:
+    """A `restock ingest FOLDER --watch` in its own process."""
 
     def __init__(self, folder: Path, store: Path, hook: str) -> None:
         words = ["ingest", str(folder), "--store", str(store), "--json", "--watch", hook]
@@ -149,7 +149,7 @@ class Process:
         )
 
     def until(self, event: str) -> list[str]:
-        """Return the events up to and including the next of this name."""
+        """Return the events up to and including the next one of this name."""
         events: list[str] = []
         assert self.ended.stdout is not None
         for line in self.ended.stdout:
@@ -164,8 +164,8 @@ class Process:
         return self.ended.wait(60)
 
 
-class Other(Drive):
-    """A drive between nearer walls, so that it is no part of the first."""
+class NearWallsDrive(Drive):
+    """Drive between nearer walls, so that it is not taken for part of the first drive."""
 
     def topics(self) -> dict[str, Any]:
         found = super().topics()
@@ -173,19 +173,20 @@ class Other(Drive):
         return found | {"/scan": columns(tenth, scans(np.full((len(tenth), BEAMS), 2.5)))}
 
 
-def test_killed_and_started_again_nothing_is_lost_or_doubled(bag, tmp_path):
-    folder, store, told = tmp_path / "in", tmp_path / "store", tmp_path / "told"
+def test_killed_and_restarted_watch_loses_nothing(bag, tmp_path):
+    folder, store, hook_log = tmp_path / "in", tmp_path / "store", tmp_path / "told"
     shutil.copytree(bag, folder / "one")
-    other = write_bag(Other(), tmp_path / "made" / "two", storage="mcap")
-    hook = f"cat >> {told}; echo >> {told}"
-    watch = Process(folder, store, hook)
+    other = write_bag(NearWallsDrive(), tmp_path / "made" / "two", storage="mcap")
+    hook = f"cat >> {hook_log}; echo >> {hook_log}"
+    watch = WatchProcess(folder, store, hook)
     assert watch.until("hook") == ["watch", "written", "coverage", "audit", "hook"]
     shutil.copytree(other, folder / "two")
     time.sleep(0.3)
-    watch.end(signal.SIGKILL)  # before, in or after its ingest
+    watch.end(signal.SIGKILL)  # before, during or after the ingest
     (folder / "one").rename(folder / "renamed")
-    watch = Process(folder, store, hook)
-    assert watch.until("hook") == ["watch", "coverage", "audit", "hook"]  # for what was killed
+    watch = WatchProcess(folder, store, hook)
+    # for the part that was killed
+    assert watch.until("hook") == ["watch", "coverage", "audit", "hook"]
     watch.until("unchanged")
     while len(names_in(store)) < 2:
         watch.until("written")
@@ -193,16 +194,16 @@ def test_killed_and_started_again_nothing_is_lost_or_doubled(bag, tmp_path):
     assert sorted(names_in(store)) == ["one", "two"]
     with Store(store) as opened:
         found = opened.sql("SELECT count(*), count(DISTINCT transition_id) FROM transitions")
-        ((rows, different),) = found.fetchall()
-    assert rows == different
-    first = json.loads(told.read_text().splitlines()[0])
-    assert [Path(one["path"]).name for one in first["recordings"]] == ["one"]
+        ((rows, distinct),) = found.fetchall()
+    assert rows == distinct
+    first = json.loads(hook_log.read_text().splitlines()[0])
+    assert [Path(recording["path"]).name for recording in first["recordings"]] == ["one"]
     assert first["audit"].keys() == {"fail", "warn"}
 
 
 @pytest.mark.timeout(60)
-def test_a_kill_that_a_library_reports_as_an_error_ends_it(bag, tmp_path, monkeypatch):
-    """DuckDB makes an error of an interrupt in a Python function that it calls."""
+def test_interrupt_reported_as_library_error_ends_watch(bag, tmp_path, monkeypatch):
+    """DuckDB converts an interrupt inside a Python function into an error."""
     folder, store = tmp_path / "in", tmp_path / "store"
     shutil.copytree(bag, folder / "one")
     assert main(["ingest", str(folder / "one"), "--store", str(store)]) == 0
@@ -223,10 +224,10 @@ def names_in(store: Path) -> list[str]:
     return [Path(name).name for (name,) in found]
 
 
-def test_a_watch_takes_folders_and_one_command(tmp_path, shell):
-    for words, why in (
+def test_watch_arguments_are_checked(tmp_path, shell):
+    for words, message in (
         ([str(tmp_path / "none"), "--store", "s", "--watch"], "not a folder"),
         ([str(tmp_path), "--dry-run", "--watch"], "takes one command"),
         ([str(tmp_path), "--store", "s", "--watch", "a", "b"], "takes one command"),
     ):
-        assert why in shell.err("ingest", *words)
+        assert message in shell.err("ingest", *words)

@@ -1,4 +1,4 @@
-"""Several workers: the same results, whoever of them dies, and no half-written store."""
+"""Several workers: same results, surviving dead workers, and no partial stores."""
 
 import contextlib
 import errno
@@ -43,21 +43,21 @@ def _length(path: Path) -> int:
     return len(path.name)
 
 
-def test_each_path_once_whoever_dies() -> None:
+def test_each_path_has_one_result_if_workers_die() -> None:
     names = ["slow", "a", "killed1", "bb", "ccc", "gone", "dddd", "killed2"]
     found = run_in_workers(_length, [Path(name) for name in names], 2, died=lambda path, code: code)
     assert sorted(found) == list(enumerate([4, 1, -9, 2, 3, 7, 4, -9]))
 
 
-def test_a_caller_that_stops_early_stops_the_work() -> None:
+def test_closing_results_early_stops_the_workers() -> None:
     found = run_in_workers(_length, [Path("a"), *[Path("slow")] * 50], 2, died=lambda *_: -1)
     assert next(found) in ((0, 1), (1, 4))
     found.close()
     assert multiprocessing.active_children() == []
 
 
-class _Dying(IngestJob):
-    """A job whose process dies of one recording, whichever it reads it with."""
+class _DyingJob(IngestJob):
+    """Job whose process dies at one recording, alone or read together with others."""
 
     def prepare_several(self, paths, **more):
         if any(path.name == "drive1" for path in paths):
@@ -65,20 +65,23 @@ class _Dying(IngestJob):
         return super().prepare_several(paths, **more)
 
 
-def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("restock.ingest.batch.IngestJob", _Dying)
+def test_recording_of_dead_worker_is_reported_and_exits_3(bags, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("restock.ingest.batch.IngestJob", _DyingJob)
     monkeypatch.setattr("restock.ingest.batch._bundles", lambda paths, most: [[0, 1], [2]])
     drives = [str(bags / f"drive{number}") for number in range(3)]
     code = main(["ingest", *drives, "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
     out, err = capsys.readouterr()
-    said = {Path(one["path"]).name: one["status"] for one in json.loads(out)["recordings"]}
+    statuses = {
+        Path(recording["path"]).name: recording["status"]
+        for recording in json.loads(out)["recordings"]
+    }
     assert code == 3
-    assert said.pop("drive1") == "failed"
-    assert list(said.values()) == ["written"] * 2
+    assert statuses.pop("drive1") == "failed"
+    assert list(statuses.values()) == ["written"] * 2
     assert "drive1: the process that read it was killed (SIGKILL)" in err
 
 
-def test_recordings_read_together_give_what_each_gives(bags, tmp_path, monkeypatch):
+def test_recordings_read_together_give_same_results(bags, tmp_path, monkeypatch):
     evaluated, evaluate = [], conditions.label_with_probabilities
     monkeypatch.setattr(
         conditions,
@@ -99,7 +102,7 @@ def test_recordings_read_together_give_what_each_gives(bags, tmp_path, monkeypat
 
 
 def contents(store: Path) -> dict[str, str]:
-    """Return the rows of each recording's files, without ingest and time."""
+    """Return the rows of each recording's files, without columns about the ingest."""
     return {
         str(file.parent.relative_to(store)): str(
             [
@@ -112,7 +115,7 @@ def contents(store: Path) -> dict[str, str]:
 
 
 @pytest.mark.long
-def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch):
+def test_unexpected_error_fails_only_its_recording(bags, tmp_path, monkeypatch):
     from restock.ingest import pipeline
 
     preparing = pipeline.preparing
@@ -129,7 +132,7 @@ def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatc
     assert {result.status for result in results.values()} == {"written"}
 
 
-def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
+def test_disk_error_is_not_reported_as_bug(monkeypatch):
     def failing(*args, **kwargs):
         raise OSError(errno.EIO, "Input/output error")
 
@@ -138,12 +141,12 @@ def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
     assert "nas/run.mcap: cannot be read or written: Input/output error" in str(failed)
 
 
-def test_developers_see_where_a_recording_failed(bags, monkeypatch, shell):
+def test_traceback_is_printed_if_requested(bags, monkeypatch, shell):
     monkeypatch.setattr("restock.ingest.pipeline.preparing", lambda path, *_, **__: path.no_such)
     arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
-    said = shell.err(*arguments)
-    assert "drive1: a bug in Restock: AttributeError" in said
-    assert "Traceback" not in said
+    stderr = shell.err(*arguments)
+    assert "drive1: a bug in Restock: AttributeError" in stderr
+    assert "Traceback" not in stderr
     monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
     assert "Traceback (most recent call last)" in shell.err(*arguments)
 
@@ -163,7 +166,7 @@ def _alive(pid: int) -> bool:
 
 
 def descendants(pid: int) -> list[int]:
-    """Return a process's children, and theirs."""
+    """Return the ids of a process's children and their descendants."""
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that just ended
@@ -172,23 +175,23 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def begun(process: subprocess.Popen[str], store: Path) -> None:
-    """Wait until the first recording is there."""
+def wait_for_store(process: subprocess.Popen[str], store: Path) -> None:
+    """Wait until the first recording is stored."""
     while not is_store(store):
         assert process.poll() is None
         time.sleep(0.01)
 
 
 def rows(store: Path) -> dict[str, int]:
-    """source -> transitions, as a reader sees them."""
+    """Return transitions per source, as a reader sees them."""
     with Store(store) as opened:
         found = opened.sql(
             "SELECT recordings.source_file[-6:], recordings.transitions, count(*)"
             " FROM transitions JOIN recordings USING (ingest_id) GROUP BY ALL"
         ).fetchall()
-    assert all(said == there for _, said, there in found)
+    assert all(in_manifest == num_rows for _, in_manifest, num_rows in found)
     assert len({name for name, _, _ in found}) == len(found)
-    return {name: there for name, _, there in found}
+    return {name: num_rows for name, _, num_rows in found}
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux' /proc")
@@ -197,33 +200,38 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="ne
 @pytest.mark.long
 @needs_proc
 @pytest.mark.parametrize(("workers", "after_s"), one_in(3, [("2", 0.0), ("1", 0.0), ("2", 0.06)]))
-def test_a_kill_of_the_whole_command_leaves_whole_recordings(bags, tmp_path, workers, after_s):
+def test_killed_ingest_leaves_complete_recordings(bags, tmp_path, workers, after_s):
     store = tmp_path / "s"
     process = subprocess.Popen(
         command(bags, store, "--workers", workers), text=True, start_new_session=True
     )
-    begun(process, store)
+    wait_for_store(process, store)
     time.sleep(after_s)
     children = descendants(process.pid)
     process.kill()
     process.wait()
-    while any(map(_alive, children)):  # the workers end by themselves
+    while any(map(_alive, children)):  # the workers end on their own
         time.sleep(0.01)
     before = rows(store)
-    done = subprocess.run(
+    process_ = subprocess.run(
         command(bags, store, "--workers", workers), capture_output=True, text=True
     )
-    assert done.returncode == 0
-    said = {Path(one["path"]).name: one for one in json.loads(done.stdout)["recordings"]}
-    assert len(said) == 5
-    assert {name: one["transitions"] for name, one in said.items()} == rows(store)
-    unchanged = {name for name, one in said.items() if one["status"] == "unchanged"}
+    assert process_.returncode == 0
+    recordings = {
+        Path(recording["path"]).name: recording
+        for recording in json.loads(process_.stdout)["recordings"]
+    }
+    assert len(recordings) == 5
+    assert {name: recording["transitions"] for name, recording in recordings.items()} == rows(store)
+    unchanged = {
+        name for name, recording in recordings.items() if recording["status"] == "unchanged"
+    }
     assert unchanged == set(before)
 
 
-@pytest.mark.long  # 12 s; that a kill leaves whole recordings is tested always
+@pytest.mark.long  # 12 s; killed ingests are tested in every run
 @needs_proc
-def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
+def test_ctrl_c_exits_130_and_stops_workers(bags, tmp_path):
     store = tmp_path / "s"
     process = subprocess.Popen(
         command(bags, store, "--workers", "2"),
@@ -231,9 +239,9 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
         stderr=subprocess.PIPE,
         start_new_session=True,
     )
-    begun(process, store)
+    wait_for_store(process, store)
     children = descendants(process.pid)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
+    os.killpg(process.pid, signal.SIGINT)  # to the whole group, as a terminal does
     _, err = process.communicate()
     assert (process.returncode, err) == (130, "restock: interrupted; no partial files were left\n")
     while any(map(_alive, children)):
