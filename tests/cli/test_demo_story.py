@@ -43,7 +43,9 @@ def result_row(policy: str, condition: str, success: float | None) -> dict[str, 
 
 def test_strata_are_shown_by_drawn_rows(finished_stages, capsys):
     """Regression: the panel's plan was printed as if it had been drawn."""
-    demo.tell(finished_stages, {"results": [result_row("agent", "nominal", 1.0)]}, stdout())
+    demo.print_results(
+        finished_stages, {"results": [result_row("agent", "nominal", 1.0)]}, stdout()
+    )
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     drawn_rows = Run.open(finished_stages.run).table("strata").to_pylist()
     whole = sum(row["drawn_rows"] for row in drawn_rows)

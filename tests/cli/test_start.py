@@ -13,8 +13,8 @@ from support.long import one_in
 
 from restock.cli.start import outcomes
 from restock.cli.start.stages import Stage
-from restock.cli.start.start import StartCommand, Way
-from restock.cli.start.work import Ended, Work
+from restock.cli.start.start import Pipeline, StartCommand
+from restock.cli.start.work import StageResult, Work
 from restock.errors import RestockError
 from restock.replay.store.store import Store
 
@@ -104,14 +104,14 @@ def test_dry_run_prints_commands_and_writes_nothing(tmp_path, shell):
 @pytest.mark.parametrize("fails", one_in(2, ["eval", "judge"]))
 def test_failed_evaluation_stops_with_remedy(tmp_path: Path, fails: str) -> None:
     class Failing(Work):
-        def do(self, stage: Stage) -> Ended:
+        def do(self, stage: Stage) -> StageResult:
             ended = super().do(stage)
             if stage.name == fails:
                 ended.status, ended.errors = "failed", ["no room"]
             return ended
 
     work = Failing(tmp_path / "out", Verbs(), SILENT, plan=True)
-    stopped = Way(StartCommand(("bags",), tmp_path / "out"), work).go()
+    stopped = Pipeline(StartCommand(("bags",), tmp_path / "out"), work).go()
     assert work.ended[-1].name == "report"
     assert stopped is not None
     assert "restock eval" in stopped.why

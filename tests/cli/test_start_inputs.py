@@ -24,8 +24,8 @@ from restock import cli
 from restock.cli.start import stages
 from restock.cli.start.decisions import updates_settings
 from restock.cli.start.stages import Settings, Stage
-from restock.cli.start.start import StartCommand, Way
-from restock.cli.start.work import Ended, Work
+from restock.cli.start.start import Pipeline, StartCommand
+from restock.cli.start.work import StageResult, Work
 from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store
@@ -179,7 +179,7 @@ def test_task_without_goal_has_no_practice_by_success(tmp_path: Path) -> None:
     for goal in ("route", "none"):
         file.write_text(WAREHOUSE.replace('goal = "route"', f'goal = "{goal}"'))
         requested = StartCommand(("bag",), tmp_path / "out", profile=str(file), twin="yes")
-        way = Way(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
+        way = Pipeline(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
         assert way._twin() is not None
         assert ("practice.rule=success" in way.to.train) == (goal == "route")
 
@@ -216,7 +216,7 @@ def test_robot_without_lidar_has_no_blocked_aisles(tmp_path, lidar):
     assert load_profile(profile).task.lidar is lidar
     driven = [kind for kind in DEFAULT_CONDITIONS if lidar or kind != "blocked_aisle"]
     requested = StartCommand(("bag",), tmp_path / "out", profile=str(profile), twin="yes")
-    way = Way(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
+    way = Pipeline(requested, GoodStages(tmp_path / "out", cli.main, lambda line: None))
     assert way._twin() is not None
     assert way.to.kinds == (() if lidar else tuple(driven))  # empty: every kind
     conditions = [one for one in way.to.train if one.startswith("env.conditions")]
@@ -227,8 +227,8 @@ def test_robot_without_lidar_has_no_blocked_aisles(tmp_path, lidar):
 class GoodStages(Work):
     """Fake stages: the floor has room for every mission, and the fit is good."""
 
-    def do(self, stage: Stage) -> Ended:
-        return Ended(stage.name, "", "done", document={"episodes": list(DEFAULT_CONDITIONS)})
+    def do(self, stage: Stage) -> StageResult:
+        return StageResult(stage.name, "", "done", document={"episodes": list(DEFAULT_CONDITIONS)})
 
 
 def test_few_rows_leave_draws_for_twin() -> None:

@@ -22,7 +22,7 @@ from support.bag_samples import (
 from support.paths import SHARED
 
 from restock.cli import main
-from restock.cli.data.info import describe_recording, offered
+from restock.cli.data.info import describe_recording, parse_qos
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording, recordings_in
 from restock.ingest.containers.recording import Recording
@@ -528,7 +528,7 @@ OFFERED = {
 
 @pytest.mark.parametrize("text", OFFERED)
 def test_offered_qos_of_every_version_is_parsed(text):
-    assert offered(text) == OFFERED[text]
+    assert parse_qos(text) == OFFERED[text]
 
 
 def test_info_finds_damage_only_if_it_reads_messages(folder, shell):

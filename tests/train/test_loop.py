@@ -16,7 +16,7 @@ import torch
 from support.toy_run import assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
-from restock.cli.learning.train import no_update
+from restock.cli.learning.train import explain_no_update
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train import session as session_module
@@ -266,7 +266,7 @@ def test_best_checkpoint_has_best_evaluation(undisturbed: Session) -> None:
 def test_warmup_collects_without_learning(tmp_path):
     settings = config(schedule={"env_steps": 400, "warmup_env_steps": 400})
     live = session(tmp_path / "a", settings, logs=None)
-    text = no_update(train(live), settings)
+    text = explain_no_update(train(live), settings)
     live.close()
     assert live.learner.gradient_steps == 0
     assert len(live.ring) > 300

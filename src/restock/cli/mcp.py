@@ -67,11 +67,11 @@ class McpCommand:
         )
         hints = ToolAnnotations(read_only_hint=True)
         for tool in tools:
-            served.add_tool(_explained(tool, ToolError), annotations=hints)
+            served.add_tool(_show_errors(tool, ToolError), annotations=hints)
         served.run("stdio")
 
 
-def _explained(
+def _show_errors(
     tool: Callable[..., dict[str, Any]], error_type: type[Exception]
 ) -> Callable[..., dict[str, Any]]:
     """Wrap a tool so that the client sees the text of its errors, which it would otherwise hide."""
@@ -106,7 +106,7 @@ class _Questions:
         lost: list[str] = []
         with (
             open_place(self.place, lost=lost.append, confined=True) as connection,
-            self._limited(connection),
+            self._limit_time(connection),
         ):
             columns, values, count = fetch(
                 connection, query, where=self.place, at_most=self.rows, only_select=True
@@ -117,7 +117,7 @@ class _Questions:
 
     def coverage(self) -> dict[str, Any]:
         """Return how many rows, episodes and recordings of a store hold each condition."""
-        return {"conditions": self._answer("coverage", self.place)}
+        return {"conditions": self._run_verb("coverage", self.place)}
 
     def events(self, condition: str = "") -> dict[str, Any]:
         """List a store's events, all or of one condition: where, when, how long, and the outcome.
@@ -136,7 +136,7 @@ class _Questions:
         """
         if row and not _ROW.fullmatch(row):
             raise QueryError(f"{row!r} is not a row", where="row", remedy="give digits, or 1200/17")
-        found = self._answer("trace", self.place, *([row] if row else []))
+        found = self._run_verb("trace", self.place, *([row] if row else []))
         return found if isinstance(found, dict) else {"rows": found}
 
     def diagnose(self, twin: bool = False) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class _Questions:
         For a store or a panel, tell whether its rows are at fault. With `twin`, also compare them
         with rows of the twin, which takes longer.
         """
-        found = self._answer("diagnose", self.place, *([] if twin else ["--no-twin"]))
+        found = self._run_verb("diagnose", self.place, *([] if twin else ["--no-twin"]))
         return dict(found)
 
     def gate(self) -> dict[str, Any]:
@@ -156,7 +156,7 @@ class _Questions:
         file = Path(self.place) / "gate" / "gate.json"
         return dict(self._cut(read_json(file, error=RunError, remedy=remedy)))
 
-    def _answer(self, *words: str) -> Any:
+    def _run_verb(self, *words: str) -> Any:
         """Run a verb in a process that can be ended, and return what it prints as JSON."""
         command = [sys.executable, "-m", "restock", *words, "--json"]
         try:
@@ -183,7 +183,7 @@ class _Questions:
         return [*map(self._cut, value[: self.rows]), *more]
 
     @contextmanager
-    def _limited(self, connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
+    def _limit_time(self, connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
         """Interrupt the connection's queries after `seconds`."""
         ended, late = Event(), Event()
 

@@ -31,7 +31,7 @@ _SOFTWARE = ("free", "software")  # kinds of settings that are not meant to chan
 T = TypeVar("T")
 
 
-class _Seen(NamedTuple):
+class _RunSummary(NamedTuple):
     """What the page shows about a run."""
 
     run: Run
@@ -50,7 +50,7 @@ def history_page(folder: Path) -> dict[str, Any]:
     Raises:
         RunError: there is neither a run nor a store in the folder.
     """
-    found, stores = _places(folder)
+    found, stores = _find_places(folder)
     if not found and not stores:
         raise RunError(
             "holds no run and no store" if folder.is_dir() else "no such folder",
@@ -58,9 +58,11 @@ def history_page(folder: Path) -> dict[str, Any]:
             remedy="give a run (`restock train --out`), or a folder of runs and stores",
         )
     missing: Rows = []
-    runs = sorted(_read(_seen, found, missing), key=lambda one: _began(one.run))
+    runs = sorted(_read(_read_run, found, missing), key=lambda one: _start_ns(one.run))
     fed_from = ((one.run.document.get("panel") or {}).get("store") for one in runs)
-    weeks = list(_read(_weeks, stores or map(Path, filter(None, dict.fromkeys(fed_from))), missing))
+    weeks = list(
+        _read(_weeks_section, stores or map(Path, filter(None, dict.fromkeys(fed_from))), missing)
+    )
     changes = [_change(a.run, b.run) for a, b in itertools.pairwise(runs)]
     headline = f"{counted(len(runs), 'run')}, {counted(len(weeks), 'store')}"
     if changes:
@@ -72,8 +74,8 @@ def history_page(folder: Path) -> dict[str, Any]:
         "headline": headline,
         "lead": "Runs are in order of their start; each is compared with the run before it.",
         "sections": [
-            _runs(runs),
-            _changes(runs, changes),
+            _runs_section(runs),
+            _changes_section(runs, changes),
             *weeks,
             Section("missing", "What could not be read", tables=[Table(missing)])
             if missing
@@ -83,7 +85,7 @@ def history_page(folder: Path) -> dict[str, Any]:
     }
 
 
-def _places(folder: Path) -> tuple[list[Path], list[Path]]:
+def _find_places(folder: Path) -> tuple[list[Path], list[Path]]:
     """Find the runs and the stores of a folder."""
     runs, stores = [], []
     for name, below, files in os.walk(folder, followlinks=True):
@@ -110,18 +112,18 @@ def _read(read: Callable[[Path], T | None], places: Iterable[Path], missing: Row
             missing.append({"place": str(place), "why": str(error)})
 
 
-def _began(run: Run) -> int:
+def _start_ns(run: Run) -> int:
     return int(run.document.get("created_ns") or 0)
 
 
-def _names(runs: Sequence[_Seen]) -> list[str]:
+def _names(runs: Sequence[_RunSummary]) -> list[str]:
     """Name each run by its folder, and by the parent folder too if runs share the name."""
     paths = [one.run.path for one in runs]
     names = Counter(path.name for path in paths)
     return [path.name if names[path.name] == 1 else "/".join(path.parts[-2:]) for path in paths]
 
 
-def _seen(path: Path) -> _Seen:
+def _read_run(path: Path) -> _RunSummary:
     """Read a run. Success is from `restock eval`, or else from training's last evaluation."""
     run = Run.open(path)
     progress, by = run.table("progress"), "restock eval"
@@ -136,7 +138,7 @@ def _seen(path: Path) -> _Seen:
         for row in ([] if driven is None else driven.to_pylist())
         if row["perturbation"] in CLEAN
     ]
-    return _Seen(run, steps, by, summary_rows(rows), fed_shares(run))
+    return _RunSummary(run, steps, by, summary_rows(rows), fed_shares(run))
 
 
 def _change(before: Run, run: Run) -> dict[str, Any]:
@@ -160,14 +162,14 @@ def _outcome(change: dict[str, Any]) -> str:
     return "; ".join(better_and_worse(shown)[0]) or "no difference shown"
 
 
-def _runs(runs: Sequence[_Seen]) -> Section | None:
+def _runs_section(runs: Sequence[_RunSummary]) -> Section | None:
     if not runs:
         return None
     table = []
-    for name, one in zip(_names(runs), runs, strict=True):
-        panel, began = one.run.document.get("panel") or {}, _began(one.run) / 1e9
+    for name, summary in zip(_names(runs), runs, strict=True):
+        panel, began = summary.run.document.get("panel") or {}, _start_ns(summary.run) / 1e9
         logs = f"{Path(panel['store']).name}@{panel['store_version']}" if panel else "none"
-        fed = [f"{words(row['stratum'])} {row['drawn_share']:.1%}" for row in one.fed]
+        fed = [f"{words(row['stratum'])} {row['drawn_share']:.1%}" for row in summary.fed]
         table.append(
             {
                 "run": name,
@@ -175,14 +177,14 @@ def _runs(runs: Sequence[_Seen]) -> Section | None:
                 "logs": logs,
                 "logged rows": count(panel.get("rows")),
                 "fed": ", ".join(fed),
-                "environment steps": count(one.env_steps),
-                "driven by": one.by,
-                "episodes": count(sum(row["episodes"] for row in one.success)),
+                "environment steps": count(summary.env_steps),
+                "driven by": summary.by,
+                "episodes": count(sum(row["episodes"] for row in summary.success)),
                 **{
                     words(row["condition"]): interval_text(
                         row["success"], row["success_low"], row["success_high"]
                     )
-                    for row in one.success
+                    for row in summary.success
                     if row["success"] is not None
                 },
             }
@@ -194,17 +196,17 @@ def _runs(runs: Sequence[_Seen]) -> Section | None:
         " perturbation, with 95 % Wilson intervals, from `restock eval` or else from the last"
         " evaluation in training. Runs may have driven different missions; the table below counts"
         " only missions that both runs of a pair drove.",
-        tables=[_even(table)],
+        tables=[_fill_columns(table)],
     )
 
 
-def _even(rows: Rows) -> Table:
+def _fill_columns(rows: Rows) -> Table:
     """Return a table from rows with different columns; cells that a row lacks are empty."""
     columns = dict.fromkeys(column for row in rows for column in row)
     return Table([dict.fromkeys(columns, "") | row for row in rows])
 
 
-def _changes(runs: Sequence[_Seen], changes: Rows) -> Section | None:
+def _changes_section(runs: Sequence[_RunSummary], changes: Rows) -> Section | None:
     if not changes:
         return None
     names = _names(runs)
@@ -248,7 +250,7 @@ def _logs(panels: dict[str, Any] | None) -> str:
     return f"{rows['in']:,} rows in, {rows['out']:,} out, {rows['both']:,} in both"
 
 
-def _weeks(place: Path) -> Section | None:
+def _weeks_section(place: Path) -> Section | None:
     """Return a section with a chart and a table of a store's weeks; None if there are no rows."""
     if not is_store(place):
         return None
@@ -264,5 +266,5 @@ def _weeks(place: Path) -> Section | None:
         line[name] = f"{row['events']:,} events" if row["events"] else f"{row['rows_held']:,} rows"
         if row["goal_episodes"]:
             line[name] += f", {row['successes']} of {row['goal_episodes']} arrived"
-    title, table = f"{place.name}: week by week", _even([*weeks.values()])
+    title, table = f"{place.name}: week by week", _fill_columns([*weeks.values()])
     return replace(section, id=f"weeks-{place.name}", title=title, tables=[table])

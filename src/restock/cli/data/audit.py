@@ -179,9 +179,9 @@ class AuditCommand:
             from restock.train.judge.gate import passed_gate
 
             try:
-                found = of_gate(passed_gate(self._beside()["run"], self.baseline))
+                found = gate_findings(passed_gate(self._beside()["run"], self.baseline))
             except RestockError as error:
-                found = refused("comparable", error, option=f"--baseline {self.baseline}")
+                found = failed_comparison("comparable", error, option=f"--baseline {self.baseline}")
             parts.append(Part("gate", found))
         return parts
 
@@ -191,9 +191,9 @@ class AuditCommand:
         try:
             with Store(old) as first, Store(self.store) as second:
                 first.verify()
-                return of_difference(diff_stores(first, second), old=old)
+                return difference_findings(diff_stores(first, second), old=old)
         except RestockError as error:
-            return refused("comparable", error, option=f"--against {old}")
+            return failed_comparison("comparable", error, option=f"--against {old}")
 
     def _write(self, parts: Sequence[Part], failing: set[str]) -> None:
         """Write the findings as JUnit XML, if --junit was given."""
@@ -332,7 +332,7 @@ class Part(NamedTuple):
     findings: list[Finding]
 
 
-def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
+def difference_findings(document: dict[str, Any], *, old: str) -> list[Finding]:
     """Return the difference of two stores (`diff_stores`) as findings.
 
     What the new store lost is a failure. Changed definitions and labels are a warning, because they
@@ -341,11 +341,9 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
     recordings, episodes = document["recordings"], document["episodes"]
     gone = [row for row in recordings if row["change"] == "out"]
     changes = episodes["changes"]
-    with_recordings = {row["recording_id"] for row in gone}
+    gone_ids = {row["recording_id"] for row in gone}
     lost = [
-        row
-        for row in changes
-        if row["change"] == "out" and row.get("recording_id") not in with_recordings
+        row for row in changes if row["change"] == "out" and row.get("recording_id") not in gone_ids
     ]
     definitions = [row for row in document["definitions"] if row["what"] != "restock_version"]
     found: list[tuple[str, Severity, str, str, list[dict[str, Any]]]] = [
@@ -364,10 +362,10 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
          "nothing to do: these recordings explain the differences",
          [row for row in recordings if row["change"] != "out"]),
     ]  # fmt: skip
-    return [_as_finding(*one) for one in found]
+    return [_make_finding(*one) for one in found]
 
 
-def of_gate(document: Mapping[str, Any]) -> list[Finding]:
+def gate_findings(document: Mapping[str, Any]) -> list[Finding]:
     """Return a finding for each test of a run's gate: it fails unless shown not to be worse."""
     from restock.train.judge.sequential import NOT_WORSE
 
@@ -375,7 +373,7 @@ def of_gate(document: Mapping[str, Any]) -> list[Finding]:
     for cell in document["cells"]:
         shown = {key: value for key, value in cell.items() if key != "curve" and value is not None}
         found.append(
-            _as_finding(
+            _make_finding(
                 f"{cell['measure']}.{cell['perturbation']}.{cell['condition']}",
                 "error",
                 f"{cell['name']}: not worse than {document['baseline']}",
@@ -386,7 +384,7 @@ def of_gate(document: Mapping[str, Any]) -> list[Finding]:
     return found
 
 
-def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
+def failed_comparison(name: str, error: RestockError, *, option: str) -> list[Finding]:
     """Return a failed finding for a comparison that was not possible, so that a pipeline notices.
 
     `option` is the option that requested the comparison, with its value.
@@ -394,10 +392,10 @@ def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
     row = {"what": error.what, "where": error.where or ""}
     where = f"{error.where}: " if error.where and error.where not in option else ""
     advice = error.remedy or f"correct {option.split()[0]}, or leave it out"
-    return [_as_finding(name, "error", f"{option}: {where}{error.what}", advice, [row])]
+    return [_make_finding(name, "error", f"{option}: {where}{error.what}", advice, [row])]
 
 
-def _as_finding(
+def _make_finding(
     name: str, severity: Severity, doc: str, advice: str, rows: Iterable[dict[str, Any]]
 ) -> Finding:
     every = list(rows)

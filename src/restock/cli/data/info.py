@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from restock import native
 from restock.cli import output
-from restock.cli.data.night import info_total
+from restock.cli.data.totals import info_total
 from restock.cli.words import Option, Positional
 from restock.errors import ExitCode, RecordingError, counted, quoted, visible
 from restock.process import cores, install_command, installed
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
     from restock.ingest.containers.storage import Watch
 
-NAMED = 10  # at most so many attachments, metadata records, or entries of a record are listed
+MAX_NAMED = 10  # at most so many attachments, metadata records, or entries of a record are listed
 MAX_VALUE = 60  # characters of an entry's value that are shown
 NANOSECONDS = 1_000_000_000
 # Names of rmw's numbers: early versions of rosbag2 wrote numbers.
@@ -177,7 +177,7 @@ def describe_recording(
                     "encoding": topic.encoding,
                     "definition": topic.definition,
                     "skipped": topic.skipped,
-                    "qos": offered(recording.qos(topic.name)),
+                    "qos": parse_qos(recording.qos(topic.name)),
                     **({"clock": compared.get(topic.name)} if clocks else {}),
                 }
                 for topic in recording.topics.values()
@@ -197,7 +197,7 @@ def describe_recording(
         }
 
 
-def offered(text: str) -> list[dict[str, Any]]:
+def parse_qos(text: str) -> list[dict[str, Any]]:
     """Return the QoS profiles that publishers offered, without duplicates.
 
     Reads reliability, durability, history and depth, if the text has them. The text is not parsed
@@ -205,13 +205,13 @@ def offered(text: str) -> list[dict[str, Any]]:
     """
     found: list[dict[str, Any]] = []
     for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MAX_PROFILES + 1]:
-        said = dict(re.findall(r"^\s*(\w+):\s*(\w+)\s*$", block, re.MULTILINE))
+        values = dict(re.findall(r"^\s*(\w+):\s*(\w+)\s*$", block, re.MULTILINE))
         one: dict[str, Any] = {}
         for key, names in _QOS.items():
-            if (value := said.get(key)) is not None:
+            if (value := values.get(key)) is not None:
                 known = value.isascii() and value.isdigit() and int(value) < len(names)
                 one[key] = names[int(value)] if known else value
-        if (depth := said.get("depth", "")).isascii() and depth.isdigit():
+        if (depth := values.get("depth", "")).isascii() and depth.isdigit():
             one["depth"] = int(depth)
         if one and one not in found:
             found.append(one)
@@ -260,8 +260,8 @@ def _names(names: list[str]) -> str:
         f"{name or '(unnamed)'}{f' ({count})' if count > 1 else ''}"
         for name, count in often.items()
     ]
-    more = f" and {len(listed) - NAMED:,} more" if len(listed) > NAMED else ""
-    return ", ".join(listed[:NAMED]) + more
+    more = f" and {len(listed) - MAX_NAMED:,} more" if len(listed) > MAX_NAMED else ""
+    return ", ".join(listed[:MAX_NAMED]) + more
 
 
 def _qos(profile: dict[str, Any]) -> str:
@@ -311,12 +311,12 @@ def _print(entry: dict[str, Any]) -> None:
     ):
         if names:
             sys.stdout.write(f"{what}, {len(names):,}: {_names(names)}\n")
-    for said in entry["says"]:
-        entries = list(said["entries"].items())
-        pairs = [f"{name}={value[:MAX_VALUE]}" for name, value in entries[:NAMED]]
-        if len(entries) > NAMED:
-            pairs.append(f"and {len(entries) - NAMED:,} more")
-        sys.stdout.write(visible(f"{said['source']}: {', '.join(pairs)}") + "\n")
+    for record in entry["says"]:
+        entries = list(record["entries"].items())
+        pairs = [f"{name}={value[:MAX_VALUE]}" for name, value in entries[:MAX_NAMED]]
+        if len(entries) > MAX_NAMED:
+            pairs.append(f"and {len(entries) - MAX_NAMED:,} more")
+        sys.stdout.write(visible(f"{record['source']}: {', '.join(pairs)}") + "\n")
     sys.stdout.flush()
     for line in entry["damage"]:
         sys.stderr.write(visible(f"{entry['path']}: damaged: {line}") + "\n")

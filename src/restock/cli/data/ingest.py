@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 from restock.cli import output
-from restock.cli.data.night import Night
+from restock.cli.data.totals import IngestSummary
 from restock.cli.words import Option, Positional, Repeated
 from restock.errors import (
     ConfigError,
@@ -108,7 +108,8 @@ class IngestCommand:
             self._watch(job)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
-        night = Night(paths) if len(paths) > 1 and not (self.verbose or self.json) else None
+        in_lines = len(paths) > 1 and not (self.verbose or self.json)
+        summary = IngestSummary(paths) if in_lines else None
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
             for path, result in ingest_all(paths, job, workers=self.workers, watch=advance.part):
@@ -118,19 +119,19 @@ class IngestCommand:
                     if isinstance(result, StoreError):  # its message names only the store
                         reported = f"{visible(str(path))}: was not added: {reported}"
                     failures.append({"path": str(path), "status": "failed", "error": reported})
-                    said = night.refuse(path, result) if night is not None else reported
-                    sys.stderr.write(f"restock: {said}\n")
+                    line = summary.refuse(path, result) if summary is not None else reported
+                    sys.stderr.write(f"restock: {line}\n")
                     continue
                 lossy |= result.lossy
                 outcomes.append(as_json(result))
-                if night is not None:
-                    output.print_text(night.add(result))
+                if summary is not None:
+                    output.print_text(summary.add(result))
                 elif not self.json:
                     show(result)
         if store is not None and outcomes:
             StoreWriter(store).clean()
-        if night is not None:
-            output.print_text(night.total())
+        if summary is not None:
+            output.print_text(summary.total())
         if self.json:
             output.print_json({"recordings": outcomes + failures})
         if not outcomes:
@@ -271,7 +272,7 @@ def show(outcome: IngestResult) -> None:
         )
     scores = {score.condition: score for score in outcome.scores}
 
-    def against_truth(name: str) -> dict[str, Any]:
+    def score_cells(name: str) -> dict[str, Any]:
         score = scores.get(name)
         return {
             "precision": score.precision if score else None,
@@ -286,18 +287,18 @@ def show(outcome: IngestResult) -> None:
             "transitions": count,
             "named by it": outcome.named[name],
             "share": outcome.named[name] / max(row["transitions"], 1),
-            **against_truth(name),
+            **score_cells(name),
         }
         for name, count in outcome.conditions.items()
     ]
     output.print_table(labels, output.reported(labels))
     if outcome.exposures:  # these hold whatever the outcome is
         labels = [
-            {"exposure": name, "transitions": count, **against_truth(name)}
+            {"exposure": name, "transitions": count, **score_cells(name)}
             for name, count in outcome.exposures.items()
         ]
         output.print_table(labels, output.reported(labels))
-    for line in _unknown(row):
+    for line in _list_unknown(row):
         output.print_text(line)
     output.print_text(
         f"{counted(row['ticks'], 'tick')} = {counted(row['transitions'], 'transition')}"
@@ -319,7 +320,7 @@ def show(outcome: IngestResult) -> None:
     output.print_text()
 
 
-def _unknown(row: Mapping[str, Any]) -> list[str]:
+def _list_unknown(row: Mapping[str, Any]) -> list[str]:
     """List the conditions that are unknown for a recording's rows, one line per reason."""
     by_reason: dict[str, list[str]] = {}
     for one in row["unknown_conditions"] or []:

@@ -90,7 +90,7 @@ class MixCommand:
 def describe(plan: PanelPlan) -> dict[str, Any]:
     """Return the plan as `--json` prints it."""
     return {
-        "strata": [_line(stratum) for stratum in plan.strata],
+        "strata": [_stratum_row(stratum) for stratum in plan.strata],
         "rows": len(plan.panel_rows),
         "left_out": plan.left_out,
         "evaluation_split": {
@@ -120,7 +120,7 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
     }
 
 
-def _line(stratum: Stratum) -> dict[str, Any]:
+def _stratum_row(stratum: Stratum) -> dict[str, Any]:
     values = msgspec.structs.asdict(stratum)
     return {"stratum": values.pop("name"), **values}
 
@@ -156,14 +156,14 @@ def _percent(share: float) -> float:
     return round(100 * share, 2)
 
 
-def _missing(line: dict[str, Any]) -> str:
+def _describe_missing(line: dict[str, Any]) -> str:
     """Say how many more rows would fill a stratum; empty if it is full."""
     if not line["missing_rows"]:
         return ""
     return f"; {counted(line['missing_rows'], 'more row')} would fill it"
 
 
-def _in_training(document: dict[str, Any], most: float) -> list[str]:
+def _describe_training(document: dict[str, Any], most: float) -> list[str]:
     """Warn of strata whose logged rows cannot fill their quota at the default training budget."""
     updates, batch_size = TRAINING
     short = []
@@ -186,7 +186,9 @@ def _in_training(document: dict[str, Any], most: float) -> list[str]:
 def _summary(document: dict[str, Any]) -> list[str]:
     strata = document["strata"]
     lines = [
-        f"{line['stratum']}: {line['note']}{_missing(line)}" for line in strata if line["note"]
+        f"{line['stratum']}: {line['note']}{_describe_missing(line)}"
+        for line in strata
+        if line["note"]
     ]
     if any(line["missing_rows"] for line in strata):
         lines.append("`restock coverage gaps` shows how much driving that takes")
@@ -212,7 +214,7 @@ def _summary(document: dict[str, Any]) -> list[str]:
         "planned_draws to those of your training); a run plans with its own number"
     ]
     if (most := document["max_replays_per_row"]) is not None:
-        draws += _in_training(document, most)
+        draws += _describe_training(document, most)
     version = document["store_version"]
     source = "the table" if version < 0 else f"store version {version}"
     lines += [

@@ -143,10 +143,10 @@ class ProfileCommand:
             )
         elif self.out is None:
             sys.stdout.write(toml)
-        said = [str(each) for each in proposal.advice]
-        said += [f"lost: {loss}" for loss in losses]
-        said += [finding.reported for finding in proposal.findings]
-        for line in said:
+        lines = [str(each) for each in proposal.advice]
+        lines += [f"lost: {loss}" for loss in losses]
+        lines += [finding.reported for finding in proposal.findings]
+        for line in lines:
             output.say(visible(line))
         for problem in proposal.problems:
             names = visible(", ".join(self.paths))

@@ -84,12 +84,12 @@ class SqlCommand:
                 self._prompt(connection)
             else:
                 text = sys.stdin.read() if query in (None, "-") else query
-                self._answer(connection, text or "", alone=True)
+                self._run_query(connection, text or "", alone=True)
         for loss in losses:
             sys.stderr.write(f"lost: {loss}\n")
         return ExitCode.LOSSY if losses else ExitCode.OK
 
-    def _answer(
+    def _run_query(
         self, connection: duckdb.DuckDBPyConnection, text: str, *, alone: bool = False
     ) -> None:
         from restock.replay.store.query import fetch
@@ -114,7 +114,9 @@ class SqlCommand:
         elif self.csv:
             output.print_csv(rows, columns)
         elif records:
-            output.print_records([_cut(row) for row in rows] if terminal else rows, columns)
+            output.print_records(
+                [_shorten_lists(row) for row in rows] if terminal else rows, columns
+            )
         elif terminal:
             hidden = output.print_elided(rows, columns)
         else:
@@ -172,12 +174,12 @@ class SqlCommand:
                     if word in (".help", "help"):
                         output.say(HELP)
                     elif word == ".tables":
-                        self._answer(connection, _TABLES)
+                        self._run_query(connection, _TABLES)
                     else:
                         return
                 if text.strip().endswith((";", RECORDS)):
-                    question, text = text, ""
-                    self._answer(connection, question)
+                    ended_query, text = text, ""
+                    self._run_query(connection, ended_query)
             except EOFError:
                 return
             except KeyboardInterrupt:  # ends this query, not the prompt
@@ -208,7 +210,7 @@ class SqlCommand:
             output.say(f"views of {store.path}, version {store.version} -> {out}")
 
 
-def _cut(row: dict[str, Any]) -> dict[str, Any]:
+def _shorten_lists(row: dict[str, Any]) -> dict[str, Any]:
     """Cut long lists of a record for a terminal."""
     return {
         name: [*value[:CUT_TO], f"… {len(value):,} in all"]

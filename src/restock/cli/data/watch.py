@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
-from restock.cli.data.night import Night, in_words, labels_of
+from restock.cli.data.totals import IngestSummary, in_words, labels_of
 from restock.cli.output import plain
 from restock.errors import ConfigError, RecordingError, RestockError, StoreError, counted, visible
 from restock.files import first_line
@@ -73,7 +73,7 @@ class Watch:
         if self.job.repeated == "keep":  # if a part was ingested too early, the whole replaces it
             self.job = replace(self.job, repeated="replace")
         self.arrivals = Arrivals(self.folders, self.job.salvage)
-        self.night = Night([Path(folder) / "recording" for folder in self.folders])
+        self.summary = IngestSummary([Path(folder) / "recording" for folder in self.folders])
 
     def run(self) -> NoReturn:
         """Ingest complete recordings and follow up, again and again."""
@@ -94,7 +94,7 @@ class Watch:
         """Ingest the complete recordings; return a row about each that was written."""
         ready = self.arrivals.complete(time.monotonic())
         for event, there, why in self.arrivals.news:
-            self.say(event, f"{self.night.name(there)}: {why}" if why else there)
+            self.say(event, f"{self.summary.name(there)}: {why}" if why else there)
         written: list[dict[str, Any]] = []
         known = 0
         for path, result in self._ingested(ready):
@@ -103,11 +103,11 @@ class Watch:
             if isinstance(result, RestockError):
                 if new:
                     event = "failed" if transient(result) else "refused"
-                    self.say(event, f"{self.night.name(path)}: {first_line(result.what)}")
+                    self.say(event, f"{self.summary.name(path)}: {first_line(result.what)}")
             elif result.status == "unchanged":
                 known += 1
             else:
-                self.say(result.status, self.night.add(result).partition(" ")[2].strip())
+                self.say(result.status, self.summary.add(result).partition(" ")[2].strip())
                 row = {key: result.manifest[key] for key in ("recording_id", "transitions")}
                 written.append({"path": str(path), **row, "labels": labels_of(result.conditions)})
         if known:
@@ -181,7 +181,7 @@ class _Arrival:
     stamp: Stamp
     since_s: float
     done: bool = False
-    said: str = ""  # the last reason reported for waiting or failing
+    reported: str = ""  # the last reason reported for waiting or failing
     not_before_s: float = 0.0
 
 
@@ -200,16 +200,16 @@ class Arrivals:
         self.news = []
         there = {path: stamp for path in self._found() if (stamp := stamp_of(path))}
         if not self._absent:  # a folder may come back with the recordings it had
-            self._known = {path: one for path, one in self._known.items() if path in there}
+            self._known = {path: arrival for path, arrival in self._known.items() if path in there}
         ready = []
         for path, stamp in there.items():
-            one = self._known.get(path)
-            if one is None or one.stamp != stamp:
+            arrival = self._known.get(path)
+            if arrival is None or arrival.stamp != stamp:
                 self._known[path] = _Arrival(stamp, now_s)
-            elif not one.done and now_s >= max(one.since_s + STILL_S, one.not_before_s):
+            elif not arrival.done and now_s >= max(arrival.since_s + STILL_S, arrival.not_before_s):
                 why = incomplete(path)
-                if why and not (self.salvage and now_s >= one.since_s + SALVAGE_AFTER_S):
-                    self._wait(path, why)
+                if why and not (self.salvage and now_s >= arrival.since_s + SALVAGE_AFTER_S):
+                    self._report_wait(path, why)
                 else:
                     ready.append(path)
         return ready
@@ -220,14 +220,16 @@ class Arrivals:
         A recording that was refused is tried again if its files change; any other failure is tried
         again later.
         """
-        one = self._known.get(path)
-        if one is None:
+        arrival = self._known.get(path)
+        if arrival is None:
             return True
         if error is not None and transient(error):
-            one.not_before_s = now_s + RETRY_S
+            arrival.not_before_s = now_s + RETRY_S
         else:
-            one.done = True
-        new, one.said = error is None or error.what != one.said, "" if error is None else error.what
+            arrival.done = True
+        what = "" if error is None else error.what
+        new = error is None or what != arrival.reported
+        arrival.reported = what
         return new
 
     def _found(self) -> Iterable[Path]:
@@ -245,10 +247,10 @@ class Arrivals:
             except RecordingError:  # none yet, or the folder has just gone: reported next time
                 continue
 
-    def _wait(self, path: Path, why: str) -> None:
-        one = self._known[path]
-        if one.said != why:
-            one.said = why
+    def _report_wait(self, path: Path, why: str) -> None:
+        arrival = self._known[path]
+        if arrival.reported != why:
+            arrival.reported = why
             self.news.append(("waiting", str(path), why))
 
 

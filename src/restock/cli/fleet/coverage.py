@@ -80,12 +80,12 @@ class CoverageCommand:
             lines = [_line(row) for row in rows + known]
             output.print_table(lines, title="rows that hold each condition")
             output.print_text(by_priority(order))
-            said = "Novelty was not measured yet." if novel is None else explain_novel_rows(novel)
-            said += f" `restock trace {quoted(self.store)}` lists the strangest rows."
-            output.print_text(said)
+            text = "Novelty was not measured yet." if novel is None else explain_novel_rows(novel)
+            text += f" `restock trace {quoted(self.store)}` lists the strangest rows."
+            output.print_text(text)
             if guessed := {r["condition"]: n for r in rows if (n := r["uncertain_recordings"])}:
-                said = uncertain_labels(guessed, max(guessed.values()))
-                output.print_text(said)
+                text = uncertain_labels(guessed, max(guessed.values()))
+                output.print_text(text)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.replay.fleet.drift import measure_drift
@@ -95,7 +95,7 @@ class CoverageCommand:
 
         advance(0, "what is missing")
         mixture, thresholds = load_mixture(self.mixture), load_thresholds(None)
-        _, missing = _missing(store, mixture, self.mixture, thresholds)
+        _, missing = _find_gaps(store, mixture, self.mixture, thresholds)
         advance(1, "drift")
         drift: Drift | str
         try:
@@ -180,7 +180,7 @@ class GapsCommand:
             refuse_existing(self.missions_out)
         expect_file_place(self.missions_out, "--missions-out")
         with Store(self.store) as store:
-            found, answer = _missing(
+            found, answer = _find_gaps(
                 store, mixture, self.mixture, thresholds, min_rows=self.min_rows, unit=self.unit
             )
             place = f"{store.path}@{store.version}"
@@ -194,7 +194,7 @@ class GapsCommand:
             _print_gaps(answer)
 
 
-def _missing(
+def _find_gaps(
     store: Store,
     mixture: Mixture,
     name: str,

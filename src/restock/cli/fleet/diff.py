@@ -111,8 +111,11 @@ def _print_stores(document: dict[str, Any]) -> None:
     if not document["different"]:
         output.print_text("no difference in recordings, episodes, labels or definitions")
         return
-    section("definitions that differ", _lines(document["definitions"], _same("what", "a", "b")))
-    section("recordings", _lines(document["recordings"], _RECORDINGS))
+    section(
+        "definitions that differ",
+        _select_columns(document["definitions"], _untitled("what", "a", "b")),
+    )
+    section("recordings", _select_columns(document["recordings"], _RECORDINGS))
     episodes = document["episodes"]
     output.print_text(
         f"episodes: {episodes['in']:,} added, {episodes['out']:,} removed, "
@@ -124,16 +127,16 @@ def _print_stores(document: dict[str, Any]) -> None:
         for row in document["shares"]
         if row["rows_a"] != row["rows_b"]
     ]
-    section("shares (difference b - a in points)", _lines(shares, _SHARES))
+    section("shares (difference b - a in points)", _select_columns(shares, _SHARES))
 
 
 def _print_panels(document: dict[str, Any]) -> None:
-    _sides(document, ("id", "store", "store_version", "rows", "effective_rows", "logs_share"))
+    _print_sides(document, ("id", "store", "store_version", "rows", "effective_rows", "logs_share"))
     if not document["different"]:
         output.print_text("the same panel: mixture, rows and weights")
         return
-    _keys("header", document["header"])
-    _keys("mixture", document["mixture"])
+    _print_keys("header", document["header"])
+    _print_keys("mixture", document["mixture"])
     rows, weights = document["rows"], document["weights"]
     output.print_text(
         f"rows: {rows['in']:,} in, {rows['out']:,} out, {rows['both']:,} in both;"
@@ -141,11 +144,11 @@ def _print_panels(document: dict[str, Any]) -> None:
         f" {weights['largest_a']:.3g} and {weights['largest_b']:.3g}"
     )
     section("rows of both in another stratum", rows["moved"])
-    strata = _lines(document["strata"], _STRATA)
+    strata = _select_columns(document["strata"], _STRATA)
     section("strata: % of rows, wanted, drawn, after weights", strata)
 
 
-def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
+def _print_sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
     heads = [f"{side}: {document[side]['path']}" for side in "ab"]
     output.print_table(
         [
@@ -156,15 +159,15 @@ def _sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
     )
 
 
-def _keys(title: str, rows: list[dict[str, Any]]) -> None:
-    section(f"{title}: keys that differ", _lines(rows, _same("key", "a", "b")))
+def _print_keys(title: str, rows: list[dict[str, Any]]) -> None:
+    section(f"{title}: keys that differ", _select_columns(rows, _untitled("key", "a", "b")))
 
 
-def _same(*names: str) -> dict[str, str]:
+def _untitled(*names: str) -> dict[str, str]:
     return {name: name for name in names}
 
 
-def _lines(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
+def _select_columns(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
     """Select columns and rename them to their titles; a column with two sides becomes two."""
     return [
         {title: value for name, of in columns.items() for title, value in _cells(row, name, of)}

@@ -56,7 +56,7 @@ class ReviewCommand:
         if self.out is not None:
             return self._write(place, self.out)
         if self.file is not None:
-            return self._take(place, self.file)
+            return self._apply_file(place, self.file)
         return self._serve(place)
 
     def _write(self, place: Location, out: Path) -> int:
@@ -85,7 +85,7 @@ class ReviewCommand:
             output.say(f"{then} restock review {quoted(self.store)} {quoted(out)}")
         return ExitCode.OK
 
-    def _take(self, place: Location, file: str) -> int:
+    def _apply_file(self, place: Location, file: str) -> int:
         from restock.ingest.relabel import correct_store, open_for_relabel, remove_corrections
         from restock.replay.review.journal import Written
         from restock.replay.review.verdicts import read_verdicts

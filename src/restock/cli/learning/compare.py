@@ -73,8 +73,8 @@ def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
     """Name each arm by its run, or by the common name of its runs without the seed."""
     names = []
     for paths in (first, second):
-        bare = {path.name.rstrip("-_.0123456789") for path in paths}
-        names.append(paths[0].name if len(paths) == 1 else bare.pop() if len(bare) == 1 else "")
+        stems = {path.name.rstrip("-_.0123456789") for path in paths}
+        names.append(paths[0].name if len(paths) == 1 else stems.pop() if len(stems) == 1 else "")
     one, other = names
     return (one, other) if one and other and one != other else ("first", "second")
 

@@ -59,7 +59,7 @@ class GateCommand:
         plan = plan_gate(
             self.run_path,
             self.baseline,
-            margins=_margins(self.margins),
+            margins=_parse_margins(self.margins),
             conditions=names_in(self.conditions),
             perturbations=names_in(self.perturbations),
             layouts=self.layouts,
@@ -81,7 +81,7 @@ class GateCommand:
         return int(ExitCode.OK if passed else ExitCode.FAILED)
 
 
-def _margins(text: str) -> dict[str, float]:
+def _parse_margins(text: str) -> dict[str, float]:
     """Parse margins such as `success=0.05,bumps_per_km=1`.
 
     Raises:

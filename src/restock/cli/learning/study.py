@@ -25,7 +25,7 @@ class StudyInterrupted(RestockError):
 
 
 @contextmanager
-def _continued_by_the_same_command(out: Path) -> Iterator[None]:
+def _explain_interrupt(out: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as stop:
@@ -72,7 +72,7 @@ class StudyCommand:
         plan = StudyPlan(load_study(self.study), self.study.parent, self.out)
         if self.dry_run:
             return self._show(plan)
-        with _continued_by_the_same_command(self.out):
+        with _explain_interrupt(self.out):
             comparisons = run_study(plan, workers=self.workers, say=say)
         found = plain(findings(plan, comparisons))
         write_text(self.out / "study.json", dumps(found, indent=1) + "\n")

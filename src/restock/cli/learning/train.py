@@ -162,7 +162,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     reported = Thread(target=say, args=(_STOPPING,))
     stopping = False
 
-    def ask(number: int, frame: FrameType | None) -> None:
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal stopping
         if not stopping:
             stopping = True
@@ -172,7 +172,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         else:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, ask)
+    before = signal.signal(signal.SIGINT, on_interrupt)
     try:
         yield lambda: stopping
     finally:
@@ -203,7 +203,7 @@ def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
 
     run = Run.open(prepared.path)
     fed = fed_shares(run)
-    for why in (no_update(outcome, prepared.config), *shortfalls(fed)):
+    for why in (explain_no_update(outcome, prepared.config), *shortfalls(fed)):
         if why is not None:
             say(f"warning: {why}")
     path = str(prepared.path)
@@ -254,7 +254,7 @@ def describe_run(prepared: Prepared) -> str:
     if panel is not None:
         lines += describe_forecast(document["panel"], config)
     if config.teacher.has_filter:
-        lines.append(_teacher(config.teacher, panel))
+        lines.append(_describe_teacher(config.teacher, panel))
     elif config.teacher.source == PLANNER:
         lines.append(
             "teacher planner: the policy does what navigation proposes, unless Q is more than"
@@ -266,7 +266,7 @@ def describe_run(prepared: Prepared) -> str:
             f"evaluation.off_policy has no effect: {has} ([evaluation_split] of a mixture)"
         )
     if config.env.twin:
-        lines += _not_evaluated(document)
+        lines += _describe_not_evaluated(document)
         lines += report_unreachable(open_floors(config.env.layouts))
     return "\n".join(lines)
 
@@ -306,7 +306,7 @@ def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
     return lines
 
 
-def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
+def explain_no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
     """Explain why a run has learned nothing, or nothing in the twin; None if it has learned."""
     if outcome.online_updates:
         return None
@@ -325,7 +325,7 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
     )
 
 
-def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
+def _describe_teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     from restock.train.feed.teacher import select_cloned
     from restock.train.prepare import rows_by_policy
 
@@ -352,7 +352,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     )
 
 
-def _not_evaluated(document: dict[str, Any]) -> list[str]:
+def _describe_not_evaluated(document: dict[str, Any]) -> list[str]:
     """Return a sentence for each condition that the twin cannot show, with the reason."""
     from restock.ingest.task.task import LIDAR_SIGNALS
 

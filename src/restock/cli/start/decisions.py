@@ -8,9 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from restock.cli.start.outcomes import Document, of_nominal
+from restock.cli.start.outcomes import Document, nominal_verdict
 from restock.cli.start.stages import Settings
-from restock.cli.start.work import FOLDER, Ended
+from restock.cli.start.work import FOLDER, StageResult
 from restock.errors import counted
 from restock.files import read_json
 
@@ -70,7 +70,7 @@ def proposal(out: Path) -> tuple[list[str], str | None]:
     return [*others, *found.get("unreadable", [])], next(iter(found.get("read", [])), None)
 
 
-def wrong_outline(checked: Document, profile: Path | str | None) -> Stop | None:
+def stop_for_outline(checked: Document, profile: Path | str | None) -> Stop | None:
     """Return a stop if the lidar sees something inside the robot's outline most of the time."""
     inside, task = checked.get("inside_outline"), _task(profile)
     if task is None or inside is None or inside <= INSIDE:
@@ -112,7 +112,7 @@ def _task(profile: Path | str | None) -> Task | None:
 NO_ROOM = "no mission fits on the floor that the recordings show"
 
 
-def mistrust(floor: Ended, gap: Ended) -> str | None:
+def explain_mistrust(floor: StageResult, gap: StageResult) -> str | None:
     """Explain why the twin cannot be trusted in nominal driving; None if it can."""
     if not floor.good:
         return f"there is no floor to drive on: {'; '.join(floor.errors)}"
@@ -120,7 +120,7 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
         return NO_ROOM
     if not gap.good:
         return f"its gap to the logs cannot be measured: {'; '.join(gap.errors)}"
-    verdict = of_nominal(gap.document)
+    verdict = nominal_verdict(gap.document)
     if verdict is None:
         return "these logs show no nominal driving"
     if verdict["verdict"] == "trusted":
@@ -140,7 +140,7 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
     return settings
 
 
-def possible_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
+def split_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
     """Split the kinds of mission that the floor has room for: kinds to drive, kinds to leave out.
 
     Without a lidar, some kinds are left out: the robot would find a block only by driving into it.

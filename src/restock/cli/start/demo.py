@@ -17,7 +17,7 @@ from restock.cli.output import print_json, print_table, stderr, stdout
 from restock.cli.start import stages
 from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings, Stage
-from restock.cli.start.work import Work, escape, speaker
+from restock.cli.start.work import Work, escape, make_printer
 from restock.errors import ConfigError, ExitCode, policy_words, quoted
 from restock.stats import interval_text
 
@@ -72,7 +72,7 @@ class DemoCommand:
             command = ["twin", "record", "--out", str(file), "--missions", "60"]
             plan.insert(0, Stage("record", "Record", command, writes=(file.parent,)))
         console = stderr() if self.json else stdout()
-        say = speaker(console)
+        say = make_printer(console)
         work = Work(self.out, main, say, plan=self.dry_run, why=WHY)
         for stage in plan:
             ended = work.do(stage)
@@ -83,7 +83,7 @@ class DemoCommand:
             print_json({"stages": [ended.summary() for ended in work.ended], "report": str(report)})
         elif not self.dry_run:
             evaluated = next(ended for ended in work.ended if ended.name == "eval")
-            tell(to, evaluated.document, console)
+            print_results(to, evaluated.document, console)
             say(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
         return int(ExitCode.OK)
 
@@ -204,7 +204,7 @@ def steps_of(run: Path) -> int:
     return max(Run.open(run).table("progress")["env_steps"].to_pylist(), default=0)
 
 
-def tell(to: Settings, evaluated: Document, console: Console) -> None:
+def print_results(to: Settings, evaluated: Document, console: Console) -> None:
     """Print the results, read from what the stages wrote."""
     from restock.train.evaluation.film import FOLDER
     from restock.train.run.replay_audit import fed_shares, fed_table, shortfalls

@@ -22,8 +22,10 @@ def info(document: Document) -> list[str]:
     recordings = document["recordings"]
     seconds = sum(row["duration_s"] or 0.0 for row in recordings)
     messages = sum(row["messages"] for row in recordings)
-    lines = [f"{counted(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
-    return lines + _some(
+    lines = [
+        f"{counted(len(recordings), 'recording')}, {_format_time(seconds)}, {messages:,} messages"
+    ]
+    return lines + _first_lines(
         [f"damaged: {row['path']}: {what}" for row in recordings for what in row["damage"]]
     )
 
@@ -35,10 +37,10 @@ def propose(document: Document) -> list[str]:
     if unread := document.get("unread"):
         read = len(document["read"])
         lines[0] += f", by the {read} largest of {read + len(unread):,} recordings of this robot"
-    lines += _some(
+    lines += _first_lines(
         [f"left out, as it cannot be read: {one}" for one in document.get("unreadable", [])]
     )
-    lines += _some([f"lost: {loss}" for loss in document.get("losses", [])])
+    lines += _first_lines([f"lost: {loss}" for loss in document.get("losses", [])])
     lines += [f"to consider: `{each['key']}`: {each['text']}" for each in document["advice"]]
     return lines
 
@@ -49,16 +51,19 @@ def check(document: Document) -> list[str]:
         return list(document["problems"])
     made = counted(outcome["transitions"], "transition")
     episodes = counted(outcome["episodes"], "episode")
-    lines = [*document["problems"], f"{made} in {episodes} of {_time(outcome['duration_s'])}"]
+    lines = [
+        *document["problems"],
+        f"{made} in {episodes} of {_format_time(outcome['duration_s'])}",
+    ]
     missing = [
         f"{item['input']} ({item['instead']})"
         for item in outcome["stand_ins"]
-        if item["input"].split()[0] in _TELLING
+        if item["input"].split()[0] in _NAMED_INPUTS
     ]
     return lines + ([f"not in the recording: {'; '.join(missing)}"] if missing else [])
 
 
-_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # inputs to name if missing
+_NAMED_INPUTS = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # inputs to name if missing
 
 
 def ingest(document: Document) -> list[str]:
@@ -88,10 +93,10 @@ def ingest(document: Document) -> list[str]:
         lines.append(f"ticks left out: {worst}")
     failed = [row["error"].splitlines()[0] for row in rows if row["status"] == "failed"]
     lost = [f"lost: {row['path']}: {what}" for row in good for what in row["losses"]]
-    return lines + _some([f"not ingested: {why}" for why in failed]) + _some(lost)
+    return lines + _first_lines([f"not ingested: {why}" for why in failed]) + _first_lines(lost)
 
 
-def _some(lines: list[str], most: int = 3) -> list[str]:
+def _first_lines(lines: list[str], most: int = 3) -> list[str]:
     """Return the first `most` lines, and a line with the number of further ones."""
     more = [f"… and {len(lines) - most} more"] if len(lines) > most else []
     return lines[:most] + more
@@ -159,11 +164,11 @@ def gap(document: Document) -> list[str]:
     for item in document["verdicts"]:
         by.setdefault(item["verdict"], []).append(item["condition"])
     lines = ["; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in by.items())]
-    nominal = of_nominal(document)
+    nominal = nominal_verdict(document)
     return lines + [f"nominal: {reason}" for reason in (nominal or {}).get("reasons", [])]
 
 
-def of_nominal(document: Document) -> Mapping[str, Any] | None:
+def nominal_verdict(document: Document) -> Mapping[str, Any] | None:
     """Return the verdict on nominal driving, with its reasons; None if there is none."""
     return next((v for v in document.get("verdicts", []) if v["condition"] == "nominal"), None)
 
@@ -171,7 +176,7 @@ def of_nominal(document: Document) -> Mapping[str, Any] | None:
 def train(document: Document) -> list[str]:
     """Say how much the policy learned from, and what was kept."""
     twin = f", {document['env_steps']:,} steps in the twin" if document["env_steps"] else ""
-    lines = [f"{document['gradient_steps']:,} updates{twin}, {_time(document['wall_s'])}"]
+    lines = [f"{document['gradient_steps']:,} updates{twin}, {_format_time(document['wall_s'])}"]
     best = document["best"]
     if best is not None and best["success"]:
         cells = ", ".join(f"{name} {value:.2f}" for name, value in best["success"].items())
@@ -225,7 +230,7 @@ def errors(text: str) -> list[str]:
 _COMPLAINT = "restock: "
 
 
-def _time(seconds: float) -> str:
+def _format_time(seconds: float) -> str:
     if seconds >= 5400:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.1f} s"

@@ -77,7 +77,7 @@ class Settings:
         return self.out / "floor.toml"
 
     @property
-    def of_each_kind(self) -> str:
+    def episodes_option(self) -> str:
         """Return the number of episodes of each kind, as `restock eval --episodes` takes it."""
         counts = ",".join(f"{kind}={self.episodes}" for kind in self.kinds)
         return counts or str(self.episodes)
@@ -246,7 +246,7 @@ def evaluate(to: Settings, *policies: str) -> Stage:
     return Stage(
         "eval",
         "Evaluate on the same seeded episodes",
-        ["eval", str(to.run), "--episodes", to.of_each_kind, *named],
+        ["eval", str(to.run), "--episodes", to.episodes_option, *named],
         outcome=outcomes.driven,
         shows_progress=True,
     )

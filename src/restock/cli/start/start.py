@@ -13,7 +13,7 @@ from restock.cli.start import decisions, stages
 from restock.cli.start.decisions import NO_ROOM, Stop
 from restock.cli.start.outcomes import Document
 from restock.cli.start.stages import Settings
-from restock.cli.start.work import Ended, Work, escape, speaker
+from restock.cli.start.work import StageResult, Work, escape, make_printer
 from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, ExitCode, RecordingError, quoted
 
@@ -22,7 +22,7 @@ AGAIN = "then run the same command again: finished stages are kept"
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
 
-class Way:
+class Pipeline:
     """The stages from recordings to a report, run one after the other.
 
     `to` has the settings that the stages share; it is replaced as stages end. `first` is one of the
@@ -96,7 +96,7 @@ class Way:
         checked = self.work.do(stages.check(to, base or recording))
         if not checked.good:
             raise Stop(f"the profile does not fit {base or recording}", f"edit {to.profile}", AGAIN)
-        outline = decisions.wrong_outline(checked.document, to.profile)
+        outline = decisions.stop_for_outline(checked.document, to.profile)
         if outline is not None and not requested.accept:
             raise outline
 
@@ -143,7 +143,7 @@ class Way:
             )
         return covered.document, mixed.document
 
-    def _twin(self) -> Ended | None:
+    def _twin(self) -> StageResult | None:
         """Make the floor and fit the twin; return the floor, or None to train on logs alone."""
         requested, to = self.requested, self.to
         if requested.twin == "no":
@@ -159,7 +159,7 @@ class Way:
             )
         settings = ["practice.rule=success"] if decisions.has_goal(to.profile) else []
         if floor.good:
-            kinds, unseen = decisions.possible_kinds(to, floor.document)
+            kinds, unseen = decisions.split_kinds(to, floor.document)
             settings += decisions.floor_settings(to, kinds)
             if unseen:
                 names = ", ".join(unseen).replace("_", " ")
@@ -176,14 +176,14 @@ class Way:
         nothing = floor.good and floor.document.get("episodes") == []
         why, remedy = NO_ROOM if nothing else None, ""
         if why is None and requested.twin != "yes" and not self.work.plan:
-            why, remedy = decisions.mistrust(floor, gap), " (--twin yes overrides)"
+            why, remedy = decisions.explain_mistrust(floor, gap), " (--twin yes overrides)"
         if why is not None:
             self._warn(f"no training in the twin{remedy}: {why}")
             return None
         self.to = replace(to, train=tuple(settings))
         return floor
 
-    def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
+    def _policy(self, floor: StageResult | None, coverage: Document, panel: Document) -> None:
         requested, twin = self.requested, floor is not None
         settings = [*self.to.train] if twin else decisions.logs_alone_settings(coverage)
         settings += decisions.updates_settings(
@@ -194,7 +194,7 @@ class Way:
         if not trained.good:
             raise Stop("training did not finish", *trained.errors[:2], AGAIN)
 
-    def _judge(self, floor: Ended | None, panel: Document) -> None:
+    def _judge(self, floor: StageResult | None, panel: Document) -> None:
         """Evaluate in the twin and on held-out logs, and write the report."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
@@ -273,9 +273,9 @@ class StartCommand:
             raise ConfigError(f"must be a number above 0, got {self.minutes:g}", where="--minutes")
         self._check()
         first = self._expect_a_recording()
-        say = speaker(stderr() if self.json else stdout())
+        say = make_printer(stderr() if self.json else stdout())
         work = Work(self.out, main, say, plan=self.dry_run)
-        stopped = Way(self, work, first).go()
+        stopped = Pipeline(self, work, first).go()
         page = self.out / "run" / "report.html"
         reported = stopped is None or any(e.name == "report" and e.good for e in work.ended)
         if self.json:

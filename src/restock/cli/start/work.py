@@ -36,7 +36,7 @@ Dispatch = Callable[[list[str]], int]
 
 
 @dataclass
-class Ended:
+class StageResult:
     """The result of a stage, from this call or an earlier one."""
 
     name: str
@@ -78,12 +78,12 @@ class Work:
     ) -> None:
         self.out, self.dispatch, self.say, self.plan = out, dispatch, say, plan
         self.why = why or {}
-        self.ended: list[Ended] = []
+        self.ended: list[StageResult] = []
         self._stamps: list[str] = []
-        self._known: dict[str, Any] = {}
+        self._records: dict[str, Any] = {}
         record = out / FOLDER / RECORD
         if record.is_file():
-            self._known = read_json(record)
+            self._records = read_json(record)
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise RestockError(
                 "already exists, and was not made by `restock start` or `restock demo`",
@@ -93,9 +93,9 @@ class Work:
         if not plan:
             expect_installed("the way to a policy", "torch", "mujoco", "altair")
             (out / FOLDER).mkdir(parents=True, exist_ok=True)
-            self._keep()
+            self._save_records()
 
-    def do(self, stage: Stage) -> Ended:
+    def do(self, stage: Stage) -> StageResult:
         """Run a stage, or reuse its earlier result; print its command and result.
 
         Raises:
@@ -106,16 +106,18 @@ class Work:
             self.say(f"[dim]{why}[/dim]")
         if self.plan:
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
-            return self._note(Ended(stage.name, stage.line(), "planned"))
+            return self._add_result(StageResult(stage.name, stage.line(), "planned"))
         stamp = self._stamp(stage)
-        if (kept := self._before(stage, stamp)) is not None:
+        if (kept := self._earlier_result(stage, stamp)) is not None:
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]  [dim]done before[/dim]")
-            return self._note(kept)
+            return self._add_result(kept)
         if stage.decided is not None:
             if (command := stage.decided()) is None:
-                return self._note(Ended(stage.name, "", "kept", outcome=["nothing to do"]))
+                return self._add_result(
+                    StageResult(stage.name, "", "kept", outcome=["nothing to do"])
+                )
             stage = replace(stage, command=command)
-        began = self._known.get(stage.name, {})
+        began = self._records.get(stage.name, {})
         saved = any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
         if stage.resume and began.get("stamp") == stamp and saved:
             stage = replace(stage, command=list(stage.resume))
@@ -123,33 +125,33 @@ class Work:
             self._clear(stage)
         self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
         # Recorded as begun: if this process dies now, the next call runs the stage again.
-        self._known[stage.name] = {"stamp": stamp, "status": "begun"}
-        self._keep()
-        return self._note(self._run(stage, stamp), reported=stage.shows_progress)
+        self._records[stage.name] = {"stamp": stamp, "status": "begun"}
+        self._save_records()
+        return self._add_result(self._run(stage, stamp), reported=stage.shows_progress)
 
-    def _run(self, stage: Stage, stamp: str) -> Ended:
-        printed, complaints = io.StringIO(), io.StringIO()
-        said: Any = _Both(sys.stderr, complaints) if stage.shows_progress else complaints
+    def _run(self, stage: Stage, stamp: str) -> StageResult:
+        printed, stderr_text = io.StringIO(), io.StringIO()
+        copied_stderr: Any = _Tee(sys.stderr, stderr_text) if stage.shows_progress else stderr_text
         started = time.monotonic()
         sys.stdout.flush()
-        with _beside(stage) as other, redirect_stdout(printed), redirect_stderr(said):
+        with _run_beside(stage) as other, redirect_stdout(printed), redirect_stderr(copied_stderr):
             code = self.dispatch([*stage.command, "--json"])
             if code in stage.expected:
                 code = other() or code
         if code == ExitCode.INTERRUPTED:
             if not stage.shows_progress:
-                sys.stderr.write(complaints.getvalue())
+                sys.stderr.write(stderr_text.getvalue())
             raise KeyboardInterrupt
         text = printed.getvalue()
-        document = _parsed(text)
+        document = _parse(text)
         good = code in stage.expected and bool(document)
-        ended = Ended(
+        ended = StageResult(
             stage.name,
             stage.line(),
             "done" if good else "failed",
             int(code),
             stage.outcome(document) if good else [],
-            errors(complaints.getvalue()),
+            errors(stderr_text.getvalue()),
             [str(path) for path in stage.writes if path.exists()],
             time.monotonic() - started,
             stamp,
@@ -157,12 +159,12 @@ class Work:
         )
         if document:
             write_text(self._document(stage), text)
-        self._known[stage.name] = ended.summary()
-        self._keep()
+        self._records[stage.name] = ended.summary()
+        self._save_records()
         return ended
 
-    def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
-        """Print the result of a stage, and its errors unless they were `reported` before."""
+    def _add_result(self, ended: StageResult, *, reported: bool = False) -> StageResult:
+        """Add and print the result of a stage, with its errors unless they were `reported`."""
         self.ended.append(ended)
         for line in ended.outcome:
             self.say(f"   {escape(line)}")
@@ -173,9 +175,9 @@ class Work:
             self.say(f"   [dim]-> {escape(', '.join(ended.files))}[/dim]")
         return ended
 
-    def _before(self, stage: Stage, stamp: str) -> Ended | None:
+    def _earlier_result(self, stage: Stage, stamp: str) -> StageResult | None:
         """Return the result of an earlier call with the same inputs, if its files still exist."""
-        known = self._known.get(stage.name, {})
+        known = self._records.get(stage.name, {})
         if known.get("status") != "done" or known.get("stamp") != stamp:
             return None
         if any(ended.status == "done" for ended in self.ended):  # an earlier stage was run again
@@ -183,7 +185,9 @@ class Work:
         document = self._document(stage)
         if not all(path.exists() for path in (*stage.writes, document)):
             return None
-        return Ended(**known | {"status": "kept"}, document=_parsed(document.read_text("utf-8")))
+        return StageResult(
+            **known | {"status": "kept"}, document=_parse(document.read_text("utf-8"))
+        )
 
     def _stamp(self, stage: Stage) -> str:
         """Hash what a result depends on: the command, the user's files, and earlier stages."""
@@ -210,12 +214,12 @@ class Work:
     def _document(self, stage: Stage) -> Path:
         return self.out / FOLDER / f"{stage.name}.json"
 
-    def _keep(self) -> None:
-        write_text(self.out / FOLDER / RECORD, json.dumps(self._known, indent=1) + "\n")
+    def _save_records(self) -> None:
+        write_text(self.out / FOLDER / RECORD, json.dumps(self._records, indent=1) + "\n")
 
 
 @contextmanager
-def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
+def _run_beside(stage: Stage) -> Iterator[Callable[[], int]]:
     """Run a stage's second command as a process; yield a function that waits for its exit code.
 
     Its last lines are shown if it fails. It is terminated at the end of the block.
@@ -224,18 +228,18 @@ def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
         yield lambda: int(ExitCode.OK)
         return
     environment = os.environ | {"OMP_NUM_THREADS": "1"}  # one core for each of the two
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
             [sys.executable, "-m", "restock", *stage.beside],
             stdout=subprocess.DEVNULL,
-            stderr=said,
+            stderr=output,
             env=environment,
         )
 
         def wait() -> int:
             if code := process.wait():
-                said.seek(0)
-                sys.stderr.write("".join(said.readlines()[-LAST_LINES:]))
+                output.seek(0)
+                sys.stderr.write("".join(output.readlines()[-LAST_LINES:]))
             return code
 
         try:
@@ -246,7 +250,7 @@ def _beside(stage: Stage) -> Iterator[Callable[[], int]]:
                 process.wait()
 
 
-class _Both:
+class _Tee:
     """A stream that also copies what is written to it."""
 
     def __init__(self, stream: Any, copy: io.StringIO) -> None:
@@ -260,7 +264,7 @@ class _Both:
         return getattr(self._stream, name)
 
 
-def speaker(console: Console) -> Callable[[str], None]:
+def make_printer(console: Console) -> Callable[[str], None]:
     """Return a function that prints a line of markup and flushes it, so that stderr comes after."""
 
     def say(line: str) -> None:
@@ -275,7 +279,7 @@ def escape(text: str) -> str:
     return visible(text, keep="\n").replace("[", r"\[")
 
 
-def _parsed(text: str) -> Any:
+def _parse(text: str) -> Any:
     try:
         document = json.loads(text)
     except json.JSONDecodeError:

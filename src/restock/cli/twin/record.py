@@ -103,7 +103,7 @@ class RecordCommand:
         plan = RecordingPlan(
             format=self._format(),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
-            missions=_missions(self.missions),
+            missions=_parse_missions(self.missions),
             seed=self.seed,
             conditions=parse_shares(self.conditions) if self.conditions is not None else NATURAL,
             policy=self.policy,
@@ -158,7 +158,7 @@ class RecordCommand:
         return "mcap" if ending == "mcap" else "rosbag2"
 
 
-def _missions(text: str | None) -> int | MissionsFile | None:
+def _parse_missions(text: str | None) -> int | MissionsFile | None:
     """Read `--missions`: a number, or a missions file."""
     from restock.replay.fleet.missions_file import read_missions
 

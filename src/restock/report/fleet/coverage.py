@@ -21,8 +21,8 @@ from restock.report.look.blocks import (
     Rows,
     Section,
     Table,
-    ask,
     count,
+    fetch_rows,
     listed,
     percent,
     statements,
@@ -63,7 +63,7 @@ def coverage_page(store: Store, gaps: dict[str, Any], drift: Drift | str) -> dic
         f"condition they hold, and what they lack of the requirements of mixture {gaps['mixture']}"
         " and the audits.",
         "sections": [
-            _shelves(shelves, _once(store)),
+            _shelves(shelves, _priority_note(store)),
             shopping_section(gaps),
             _strangest(store, gaps["store"]),
             coverage_weeks(store)[1],
@@ -81,10 +81,10 @@ def _rows(store: Store, name: str, **parameters: Any) -> Rows:
     """Run a statement of coverage.sql and return its rows."""
     sql = statements("restock.report.fleet", "coverage.sql")[name]
     install_named(store.connection, sql)
-    return ask(store.connection, sql, **parameters)
+    return fetch_rows(store.connection, sql, **parameters)
 
 
-def _once(store: Store) -> str:
+def _priority_note(store: Store) -> str:
     return by_priority(words(name) for name in store.priority())
 
 
@@ -215,7 +215,8 @@ def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
     return every, Section(
         "weeks",
         "When was it logged?",
-        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}. {_once(store)}",
+        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}."
+        f" {_priority_note(store)}",
         figures=[Figure(charts.draw(chart))],
     )
 

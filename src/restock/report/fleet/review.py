@@ -144,7 +144,7 @@ class Review:
         return self._now
 
 
-class _Asked(msgspec.Struct):
+class _Post(msgspec.Struct):
     """The body of a POST."""
 
     entries: list[Entry] = []  # new verdicts
@@ -236,7 +236,7 @@ class Handler(BaseHTTPRequestHandler):
             return
         body = self.rfile.read(int(size))
         try:
-            posted = msgspec.json.decode(body, type=_Asked)
+            posted = msgspec.json.decode(body, type=_Post)
         except msgspec.MsgspecError as error:
             self._send(400, json.dumps({"error": f"not what the page sends: {error}"}))
             return

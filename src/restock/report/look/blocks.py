@@ -202,7 +202,7 @@ def statements(package: str, name: str) -> dict[str, str]:
     return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
 
 
-def ask(connection: duckdb.DuckDBPyConnection, sql: str, **parameters: Any) -> Rows:
+def fetch_rows(connection: duckdb.DuckDBPyConnection, sql: str, **parameters: Any) -> Rows:
     """Return the rows of a query with `$name` parameters."""
     found = connection.execute(sql, parameters or None)
     names = [column[0] for column in found.description or ()]

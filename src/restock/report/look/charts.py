@@ -162,11 +162,11 @@ def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, label
     """
     beside = (width - labels_px) // max(len(names), 1) - 24
     if len(names) > 1 and beside < 150:
-        each = layered.properties(width=max(width - labels_px - 24, 90))
+        panel = layered.properties(width=max(width - labels_px - 24, 90))
         header = alt.Header(orient="top", labelAnchor="start", labelPadding=4)
-        return each.facet(row=alt.Row(f"{key}:N", sort=list(names), header=header))
-    each = layered.properties(width=max(beside, 90))
-    return each.facet(column=alt.Column(f"{key}:N", sort=list(names)))
+        return panel.facet(row=alt.Row(f"{key}:N", sort=list(names), header=header))
+    panel = layered.properties(width=max(beside, 90))
+    return panel.facet(column=alt.Column(f"{key}:N", sort=list(names)))
 
 
 def in_words(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -399,11 +399,11 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
         line = base.mark_line(strokeWidth=2, point={"size": 26, "filled": True}).encode(
             y=alt.Y("success:Q", title="success", axis=axis, scale=domain)
         )
-        each = alt.layer(band, line).properties(
+        panel = alt.layer(band, line).properties(
             width=(width - 70) // across - 20, height=170 if across > 1 else 140
         )
         header = alt.Header(labelAnchor="start")
-        return each.facet(
+        return panel.facet(
             facet=alt.Facet("condition:N", sort=conditions, header=header), columns=across
         )
 

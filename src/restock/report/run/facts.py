@@ -13,7 +13,7 @@ from restock.errors import RestockError, RunError
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.report.look.blocks import Rows, ask, statements, words
+from restock.report.look.blocks import Rows, fetch_rows, statements, words
 from restock.train.run.kept_evaluations import (
     CloneQuality,
     read_clones,
@@ -105,7 +105,10 @@ def gather(path: Path) -> Facts:
         connection.register("evaluated", evaluated)
         for name in _TABLES:
             connection.register(name, run.table(name))
-        rows = {name: ask(connection, sql) for name, sql in statements(PACKAGE, "run.sql").items()}
+        rows = {
+            name: fetch_rows(connection, sql)
+            for name, sql in statements(PACKAGE, "run.sql").items()
+        }
     if not rows["loss"]:
         raise RunError(
             "has no update to report on yet",
@@ -183,7 +186,7 @@ def _add_panel(facts: Facts) -> None:
         assert held is not None
         with Store(held.header.store) as store:
             query = statements(PACKAGE, "store.sql")["logged"]
-            facts.logged = ask(store.connection, query)
+            facts.logged = fetch_rows(store.connection, query)
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
 

@@ -56,7 +56,7 @@ def _result(facts: Facts) -> str:
             + " better than a random policy on the same episodes"
             f" ({average:.0%} against {mean_success(random):.0%}, mean over conditions)"
         )
-    return _against_baseline(facts) + _distrust(facts)
+    return _against_baseline(facts) + _warn_of_gap(facts)
 
 
 def _policy_step(facts: Facts) -> str:
@@ -78,7 +78,7 @@ def baseline(facts: Facts) -> str | None:
     return next((name for name in BASELINES if facts.clean_cells(name)), None)
 
 
-def compared(facts: Facts, name: str | None) -> Rows:
+def compare_with(facts: Facts, name: str | None) -> Rows:
     """Compare the agent with another policy by perturbation and condition, as rows of `paired`.
 
     Empty if there is no other policy, if it was not evaluated, or if the task has no goal.
@@ -98,14 +98,14 @@ def losses(facts: Facts) -> list[str]:
         + f": {row['success_b']:.0%} against {row['success_a']:.0%}"
         for name in ("planner", "cloned")
         if facts.clean_cells(name)
-        for row in compared(facts, name)
+        for row in compare_with(facts, name)
         if row["verdict"] == "worse"
     ]
 
 
 def _against_baseline(facts: Facts) -> str:
     name = baseline(facts)
-    rows = [row for row in compared(facts, name) if row["perturbation"] == "none"]
+    rows = [row for row in compare_with(facts, name) if row["perturbation"] == "none"]
     if not rows:
         each = listed(
             [
@@ -130,7 +130,7 @@ def _against_baseline(facts: Facts) -> str:
     return f"Too few of the same episodes to tell a difference from {who}"
 
 
-def _distrust(facts: Facts) -> str:
+def _warn_of_gap(facts: Facts) -> str:
     """Warn that success in the twin may mean little, if its gap in nominal driving is large."""
     verdicts = () if facts.gap is None else facts.gap.verdicts
     nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)

@@ -19,7 +19,7 @@ HOUR_S = 3600.0
 STATUSES = ("written", "tagged", "dry run", "unchanged", "refused")
 
 
-class Night:
+class IngestSummary:
     """The recordings of one `restock ingest`: counts them, and formats their lines and total."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -57,14 +57,14 @@ class Night:
         self.duration_s += row["duration_s"]
         self.skipped += skipped
         self.dropped += sum(drop["count"] for drop in row["drops"])
-        says = [
+        parts = [
             f"{row['transitions']:,} rows",
             f"{row['duration_s'] / 60:.1f} min",
             *([in_words(labels)] if labels else []),
             *([f"{counted(skipped, 'message')} skipped"] if skipped else []),
             *wrong,
         ]
-        return f"{outcome.status:<9} {self.name(outcome.path)}: {', '.join(says)}"
+        return f"{outcome.status:<9} {self.name(outcome.path)}: {', '.join(parts)}"
 
     def refuse(self, path: Path | str, error: RestockError) -> str:
         """Count a recording that was refused; return its line."""
