@@ -1,4 +1,4 @@
-"""`restock export`: transitions as a data set of another library."""
+"""`restock export`: writes transitions as a data set of another library, or a policy as ONNX."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`restock mix`: a pinned replay panel with quotas per stratum."""
+"""`restock mix`: makes a pinned replay panel with quotas per stratum."""
 
 from __future__ import annotations
 

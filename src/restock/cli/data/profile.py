@@ -109,7 +109,7 @@ class ProfileCommand:
             self.hindsight_goals,
         )
         stem = (self.out or Path(self.paths[0])).stem
-        if self.out is None and self.robot is not None:  # else robots' profiles would share a name
+        if self.out is None and self.robot is not None:  # so that robots' profiles differ in name
             stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)

@@ -1,4 +1,4 @@
-"""`restock sql`: any question to a store, a run, a panel or recordings."""
+"""`restock sql`: queries a store, a run, a panel or recordings."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ class SqlCommand:
 
 
 def _shorten_lists(row: dict[str, Any]) -> dict[str, Any]:
-    """Cut long lists of a record for a terminal."""
+    """Cut the long lists of a row that is printed as a record on a terminal."""
     return {
         name: [*value[:CUT_TO], f"… {len(value):,} in all"]
         if isinstance(value, list | tuple) and len(value) > 2 * CUT_TO

@@ -92,7 +92,7 @@ class IngestSummary:
 
 
 def labels_of(conditions: Mapping[str, int]) -> dict[str, int]:
-    """Return label -> rows for the labels that hold in any row, without `nominal`."""
+    """Return the rows of each label that holds in any row, without `nominal`."""
     return {name: rows for name, rows in conditions.items() if rows and name != "nominal"}
 
 

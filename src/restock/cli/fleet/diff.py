@@ -72,7 +72,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
 
 
 def _kind_of(place: str) -> str:
-    """Recognise a panel or a run by its header file; anything else counts as a store."""
+    """Recognise a panel by its header and a run by its config; anything else counts as a store."""
     from restock.replay.panel.panel import HEADER
     from restock.replay.places import RUN_CONFIG
 

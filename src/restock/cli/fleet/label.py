@@ -1,4 +1,4 @@
-"""`restock store label`: new conditions over stored signals."""
+"""`restock store label`: labels a store's transitions again from their stored signals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`restock store`: joins a store's files, removes recordings from it, and checks its checksums."""
+"""`restock store`: joins a store's files, removes recordings from it, and verifies its files."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class DiagnoseCommand:
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
-    several = len(paths) > 1  # a verdict of one is said below
+    several = len(paths) > 1  # the verdict of a single run is printed below
     print_parted(
         [
             {

@@ -1,4 +1,4 @@
-"""`restock report`: one HTML page about a run."""
+"""`restock report`: writes one HTML page about a run or a folder of runs."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from restock.replay.trace.origin import Origin
 
 _LONG = 6  # a longer list is cut to this many entries
-_TABLES = ("clocks", "signals", "stand_ins")  # entries of a manifest that only --json prints
+_TABLES = ("clocks", "signals", "stand_ins")  # entries of a manifest to print only with --json
 
 
 @dataclass

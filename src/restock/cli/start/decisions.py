@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 STEPS_A_SECOND = 500  # in the twin on a free core; for planning draws
 WARM_UP_PART = 0.5  # share of the allowed draws for offline updates, if rows are few
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other stages
-INTERVALS = 20  # least number of points in every curve
+INTERVALS = 20  # least number of points in a curve
 DRIVERS = "behaviour_policies"  # key in a row of the coverage
 INSIDE = 0.5  # share of ticks with returns inside the outline above which the outline is wrong
 
@@ -42,7 +42,7 @@ def edited(profile: Path | str | None, out: Path) -> bool:
 
 
 def several_kinds(kinds: list[Any], out: Path) -> Stop:
-    """Return a stop for recordings of several kinds of robots; its remedies are a call per kind."""
+    """Return a stop for recordings of several kinds of robots, with a command for each kind."""
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
     reported = [
         f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds
@@ -168,8 +168,8 @@ def updates_settings(
     """Return settings for as many offline updates as the panel's rows and the budget allow.
 
     `max_replays_per_row` limits the draws of a row. If rows are few, half of the draws are kept for
-    the twin, and `env_steps` is planned as the steps that fit into `seconds`. Without a twin, rows
-    are recorded often enough for `INTERVALS` points in each curve.
+    the twin, and `env_steps` is planned as the steps that fit into `seconds`. Without a twin,
+    metrics are recorded often enough for `INTERVALS` points in each curve.
     """
     from restock.train.dqn.config import TrainConfig
 

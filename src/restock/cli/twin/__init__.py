@@ -1,1 +1,1 @@
-"""Verbs about the simulated warehouse: record in it, fit it to logs, measure how far it is."""
+"""Verbs about the twin: record in it, fit it to logs, and measure its gap to them."""

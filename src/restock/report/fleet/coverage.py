@@ -297,7 +297,7 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
             f"The least number of {unit} that fills {which} with {gaps['confidence']:.0%},"
             " at the rates of the store's own episodes; intervals are 95 %."
         )
-    if orders and unit == "missions":  # the twin drives no hours
+    if orders and unit == "missions":  # the twin cannot drive a plan in hours
         intro.append("`restock coverage gaps --missions-out FILE` writes it as missions to drive.")
     if unknown:
         intro.append("What was never logged has no rate, so the amount needed is not known.")

@@ -338,7 +338,7 @@ _QUIET = alt.Axis(grid=False, ticks=False)
 
 
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
-    """Draw success by condition: rows of arm, condition, value, low, high (None: unknown)."""
+    """Draw success by condition, from rows of arm, condition, value, low, high (None: unknown)."""
     return estimates(
         _by_condition(in_words(rows)),
         y="condition",

@@ -1,1 +1,1 @@
-"""Pages about runs: the report and replay card of one, a comparison of two, a study of many."""
+"""Pages about runs: report and replay card of a run, comparison of two, study of many."""

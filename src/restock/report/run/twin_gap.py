@@ -63,7 +63,7 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
 
 
 def headline(gap: TwinGap) -> str:
-    """Say in one sentence where not to trust the twin."""
+    """State in one sentence where not to trust the twin."""
     names = ", ".join(words(name) for name in gap.untrusted)
     if names:
         return f"Do not trust the twin in: {names}"
