@@ -32,18 +32,18 @@
   let lines = [];
   const given = [];  // ids of the verdicts given on this page, one list per action, for undo
 
-  function counting() {
-    const gone = new Set(lines.flatMap((line) =>
+  function verdictsThatCount() {
+    const replaced = new Set(lines.flatMap((line) =>
       line.kind === "applied" ? [] : line.instead_of ?? []));
-    return lines.filter((line) => line.kind === "verdict" && line.verdict && !gone.has(line.id));
+    return lines.filter((line) => line.kind === "verdict" && line.verdict && !replaced.has(line.id));
   }
   const inStore = () => new Set(lines.flatMap((line) => line.kind === "applied" ? line.ids : []));
   let latest = new Map();  // event -> the verdict that counts
-  function settle() {
-    latest = new Map(counting().map((entry) => [entry.event, entry]));
+  function updateLatest() {
+    latest = new Map(verdictsThatCount().map((entry) => [entry.event, entry]));
   }
   function entry(event, verdict, more = {}) {
-    const before = counting().filter((one) => one.event === event.event);
+    const before = verdictsThatCount().filter((one) => one.event === event.event);
     return {
       kind: "verdict", id: crypto.randomUUID(), by: me, event: event.event,
       episode_id: event.episode_id, condition: event.condition,
@@ -65,7 +65,7 @@
   }
   function take(state) {
     lines = state.lines;
-    settle();
+    updateLatest();
   }
   async function give(entries) {
     take(await ask("verdicts", { entries }));
@@ -75,13 +75,13 @@
   // -- the order -----------------------------------------------------------------------------
   const events = page.events;
   const marked = [];  // events that a person marked
-  let queue = [], here = null, ends = [0, 0], moment = null, now = 0;
+  let queue = [], current = null, ends = [0, 0], moment = null, now = 0;
   const ORDERS = {
     doubt: ["most doubtful first", (e) => e.doubt],
     random: ["random: estimates precision", (e) => e.random ?? Infinity],
     time: ["by time", (e) => `${e.source_file} ${e.start_time} ${e.event}`],
   };
-  function choose() {
+  function fillQueue() {
     const [, key] = ORDERS[at("order").value];
     const wanted = ["condition", "robot", "week"].map((name) => [name, at(name).value]);
     queue = events.filter((e) => wanted.every(([name, value]) => !value || e[name] === value));
@@ -90,12 +90,12 @@
   }
   const open = (event) => !latest.has(event.event);
   function nextOpen() {
-    const place = queue.indexOf(here);
+    const place = queue.indexOf(current);
     const rest = [...queue.slice(place + 1), ...queue.slice(0, place + 1)];
     return rest.find(open) ?? null;
   }
   function move(by) {
-    const place = queue.indexOf(here) + by;
+    const place = queue.indexOf(current) + by;
     if (queue[place]) show(queue[place]);
   }
 
@@ -140,7 +140,7 @@
     return loading;
   }
   async function load(event) {
-    here = event;
+    current = event;
     moment = null;
     play(false);
     at("event").hidden = event === null;
@@ -154,17 +154,17 @@
     at("look").classList.add("waiting");
     try {
       const found = await fetched(event);
-      if (here !== event) return;
+      if (current !== event) return;
       moment = found;
       now = Math.max(moment.steps.indexOf(event.first_step), 0);
       draw();
     } catch (error) {
-      if (here !== event) return;
+      if (current !== event) return;
       say(error.message, "bad");
       at("map").replaceChildren();
       at("plots").replaceChildren();
     } finally {
-      if (here === event) at("look").classList.remove("waiting");
+      if (current === event) at("look").classList.remove("waiting");
     }
     const following = nextOpen();
     if (following) fetched(following).catch(() => {});
@@ -172,7 +172,7 @@
     frames = {};
     if (!moment) return;
     fetched(event, "frames").catch((error) => ({ cameras: {}, notes: [error.message] }))
-      .then((seen) => { if (here === event) drawFrames(seen); });
+      .then((seen) => { if (current === event) drawFrames(seen); });
   }
   function drawFrames(seen) {
     frames = seen.cameras;
@@ -186,40 +186,40 @@
 
   function refresh() {
     const done = queue.filter((e) => !open(e)).length;
-    const place = queue.indexOf(here);
+    const place = queue.indexOf(current);
     at("progress").textContent =
       `${place < 0 ? "–" : place + 1} of ${queue.length}, ${done} judged`;
     at("estimate").textContent = at("order").value === "random" ? estimate() : "";
-    const kept = inStore(), count = counting().filter((one) => !kept.has(one.id)).length;
+    const kept = inStore(), count = verdictsThatCount().filter((one) => !kept.has(one.id)).length;
     at("write").textContent = `Write ${count} into the store`;
     at("write").disabled = count === 0;
     at("undo").disabled = given.length === 0;
-    if (here === null) return;
-    at("name").textContent = words(here.condition);
-    at("kind").textContent = here.marked ? "marked by you"
-      : here.labelled ? "is labelled: right?" : "is not labelled: missed?";
+    if (current === null) return;
+    at("name").textContent = words(current.condition);
+    at("kind").textContent = current.marked ? "marked by you"
+      : current.labelled ? "is labelled: right?" : "is not labelled: missed?";
     const facts = [
-      here.probability === null || here.probability === undefined ? null
-        : `probability ${here.probability.toFixed(2)}`,
-      here.why && here.why !== "probability" ? `doubt: ${here.why}` : null,
-      here.robot || null, here.source_file.split("/").pop(),
-      `${here.start_time} UTC`, `steps ${here.first_step} to ${here.last_step}`,
+      current.probability === null || current.probability === undefined ? null
+        : `probability ${current.probability.toFixed(2)}`,
+      current.why && current.why !== "probability" ? `doubt: ${current.why}` : null,
+      current.robot || null, current.source_file.split("/").pop(),
+      `${current.start_time} UTC`, `steps ${current.first_step} to ${current.last_step}`,
     ];
     at("facts").textContent = facts.filter(Boolean).join(" · ");
-    const verdict = latest.get(here.event);
+    const verdict = latest.get(current.event);
     const mine = verdict?.by === me;
     at("verdict").textContent = verdict
       ? `${mine ? "You" : "Somebody"} said ${verdict.verdict} at ${verdict.at.slice(11, 19)} UTC`
         + (kept.has(verdict.id) ? ", and it is in the store." : ".") : "";
-    const edited = ends[0] !== here.first_step || ends[1] !== here.last_step;
-    at("yes").querySelector("span").textContent = edited || here.marked
+    const edited = ends[0] !== current.first_step || ends[1] !== current.last_step;
+    at("yes").querySelector("span").textContent = edited || current.marked
       ? `Yes, ${ends[0]}..${ends[1]}` : "Yes";
   }
 
   async function judge(verdict, other = null) {
     await loading;
-    if (here === null) return;
-    const event = here;
+    if (current === null) return;
+    const event = current;
     try {
       if (event.marked) {
         if (verdict === "yes") {
@@ -255,7 +255,7 @@
     if (inStore().has(first.id)) {
       given.pop();
       say("That verdict is in the store already: judge the event again.", "bad");
-      show(events.find((e) => e.event === first.event) ?? here);
+      show(events.find((e) => e.event === first.event) ?? current);
       return;
     }
     const restored = lines.filter((line) => first.instead_of.includes(line.id));
@@ -267,14 +267,14 @@
       given.pop();
       given.pop();
       say("Undone.");
-      show(events.find((e) => e.event === first.event) ?? here);
+      show(events.find((e) => e.event === first.event) ?? current);
     } catch (error) {
       say(error.message, "bad");
     }
   }
   function mark() {
-    if (!here || !moment) return;
-    const from = here.marked ? here : { ...here };
+    if (!current || !moment) return;
+    const from = current.marked ? current : { ...current };
     pick("Mark which condition?", (name) => {
       const first = moment.steps[Math.max(now - 2, 0)];
       const last = moment.steps[Math.min(now + 2, moment.steps.length - 1)];
@@ -284,7 +284,7 @@
         labelled: false, probability: null, why: "",
       };
       marked.push(event);
-      here = event;
+      current = event;
       ends = [first, last];
       at("note").value = "";
       refresh();
@@ -293,7 +293,7 @@
     });
   }
   function pick(title, then) {
-    const names = page.conditions[here.recording].filter((name) => title.startsWith("Mark") || name !== here.condition);
+    const names = page.conditions[current.recording].filter((name) => title.startsWith("Mark") || name !== current.condition);
     at("pick-title").textContent = title;
     at("pick-names").replaceChildren(...names.map((name, number) => {
       const button = make("button", { type: "button" }, number < 9 ? `${number + 1}  ` : "", words(name));
@@ -336,7 +336,7 @@
     drawMap();
     drawPlots();
     const rule = moment.rule;
-    at("rule-doc").textContent = rule.name === here.condition ? rule.doc : "";
+    at("rule-doc").textContent = rule.name === current.condition ? rule.doc : "";
     at("rule-sql").textContent = [
       ...Object.entries(rule.let).map(([name, sql]) => `${name} =\n    ${sql.replaceAll("\n", "\n    ")}`),
       `${rule.name} (${rule.timing}) =\n    ${rule.sql.replaceAll("\n", "\n    ")}`,
@@ -360,7 +360,7 @@
       walls += `M${(moment.walls[i] - .05).toFixed(2)} ${(-moment.walls[i + 1] - .05).toFixed(2)}h.1v.1h-.1z`;
     }
     moving = {
-      event: stroke("", colour(here.condition), 9, { opacity: .45 }),
+      event: stroke("", colour(current.condition), 9, { opacity: .45 }),
       driven: stroke("", TEAL, 3),
       plan: stroke("", BLUE, 2, { "stroke-dasharray": "5 5" }),
       goal: stroke("", BLUE, 2.5),
@@ -424,15 +424,15 @@
     const speeds = Object.entries(moment.speeds), rooms = Object.entries(moment.clearances);
     if (speeds.length) panels.push(panel(width, 110, "speed, m/s", speeds, [TEAL, AMBER, SOFT]));
     if (rooms.length) panels.push(panel(width, 96, "clearance, m", rooms, [BLUE, GREY], [0, null]));
-    const probable = Object.entries(moment.probabilities).filter(([name]) => name === here.condition);
-    if (probable.length) panels.push(panel(width, 84, "", [["probability", probable[0][1]]], [colour(here.condition)], [0, 1]));
+    const probable = Object.entries(moment.probabilities).filter(([name]) => name === current.condition);
+    if (probable.length) panels.push(panel(width, 84, "", [["probability", probable[0][1]]], [colour(current.condition)], [0, 1]));
     panels.push(strips(width));
     at("plots").replaceChildren(...panels);
   }
 
   function frame(width, height, label) {
     const svg = make("svg:svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label });
-    const band = make("svg:rect", { y: TOP - 4, height: height - TOP, fill: colour(here.condition), "fill-opacity": .16 });
+    const band = make("svg:rect", { y: TOP - 4, height: height - TOP, fill: colour(current.condition), "fill-opacity": .16 });
     const mark = make("svg:path", { stroke: INK, "stroke-width": 1.5, fill: "none" });
     bands.push(band);
     cursor.push([mark, height]);
@@ -470,8 +470,8 @@
   }
 
   function strips(width) {
-    const names = Object.keys(moment.labels).filter((name) => name === here.condition || moment.labels[name].includes(1));
-    names.sort((a, b) => (a === here.condition ? -1 : b === here.condition ? 1 : a < b ? -1 : 1));
+    const names = Object.keys(moment.labels).filter((name) => name === current.condition || moment.labels[name].includes(1));
+    names.sort((a, b) => (a === current.condition ? -1 : b === current.condition ? 1 : a < b ? -1 : 1));
     const row = 32, height = TOP + names.length * row + 14;
     const [svg, mark] = frame(width, height, "labels");
     svg.classList.add("strips");
@@ -491,7 +491,7 @@
     const t = (i) => `${moment.t[i].toFixed(1)} s`;
     svg.append(text(LEFT, height - 1, t(0)), text(width - RIGHT, height - 1, t(moment.t.length - 1), SOFT, { "text-anchor": "end" }), mark);
     for (const end of [0, 1]) {
-      svg.append(make("svg:path", { class: "handle", "data-end": end, fill: colour(here.condition), stroke: "#ffffff", "stroke-width": 1.5 }));
+      svg.append(make("svg:path", { class: "handle", "data-end": end, fill: colour(current.condition), stroke: "#ffffff", "stroke-width": 1.5 }));
     }
     return svg;
   }
@@ -582,9 +582,9 @@
   for (const over of ["pointerup", "pointercancel"]) at("plots").addEventListener(over, () => { dragged = null; });
 
   // -- keys and buttons --------------------------------------------------------------------------
-  const does = {
+  const actions = {
     yes: () => judge("yes"), no: () => judge("no"), next: () => move(1), previous: () => move(-1),
-    other: () => here && !here.marked && pick("Which condition is it?", (name) => judge("no", name)),
+    other: () => current && !current.marked && pick("Which condition is it?", (name) => judge("no", name)),
     undo, mark, play: () => play(), first: () => moment && setEnd(0, moment.steps[now]),
     last: () => moment && setEnd(1, moment.steps[now]), back: () => go(now - 1), on: () => go(now + 1),
     write,
@@ -592,7 +592,7 @@
   const KEYS = { y: "yes", n: "no", ArrowRight: "next", ArrowLeft: "previous", c: "other", u: "undo",
     m: "mark", " ": "play", "[": "first", "]": "last", ",": "back", ".": "on" };
   for (const name of ["yes", "no", "next", "previous", "other", "undo", "mark", "play", "first", "last", "write"]) {
-    at(name).addEventListener("click", () => does[name]());
+    at(name).addEventListener("click", () => actions[name]());
   }
   let queued = Promise.resolve();  // keys are handled one after the other, however fast they come
   addEventListener("keydown", (key) => {
@@ -610,14 +610,14 @@
     if (key.key === "t") { key.preventDefault(); at("note").focus(); return; }
     if (!(key.key in KEYS)) return;
     key.preventDefault();
-    queued = queued.then(() => loading).then(() => does[KEYS[key.key]]());
+    queued = queued.then(() => loading).then(() => actions[KEYS[key.key]]());
   });
   at("slider").addEventListener("input", () => go(Number(at("slider").value)));
   at("note").addEventListener("change", async () => {
-    const before = here && latest.get(here.event);
+    const before = current && latest.get(current.event);
     if (!before || before.note === at("note").value.trim()) return;
     try {
-      await give([{ ...entry(here, before.verdict), note: at("note").value.trim() }]);
+      await give([{ ...entry(current, before.verdict), note: at("note").value.trim() }]);
       say("The note is kept.", "good");
       refresh();
     } catch (error) { say(error.message, "bad"); }
@@ -641,10 +641,10 @@
     at(name).closest("label").hidden = values.length < 2;
   }
   for (const name of ["order", "condition", "robot", "week"]) {
-    at(name).addEventListener("change", () => { choose(); show(queue.find(open) ?? queue[0] ?? null); });
+    at(name).addEventListener("change", () => { fillQueue(); show(queue.find(open) ?? queue[0] ?? null); });
   }
   at("about").textContent = `${events.length < page.total ? `${events.length} of ${page.total}` : events.length} events of ${page.store}.`;
-  addEventListener("resize", () => { if (moment && here) draw(); });
+  addEventListener("resize", () => { if (moment && current) draw(); });
 
   async function begin() {
     take(await ask("state", {}));
@@ -654,10 +654,10 @@
         refresh();
       } catch (error) { say(error.message, "bad"); }
     }, 3000);
-    choose();
+    fillQueue();
     await show(queue.find(open) ?? null);
   }
   begin().catch((error) => say(error.message, "bad"));
   // For tests: what is shown, and a promise that resolves when the last key has been handled.
-  window.review = { settled: () => queued.then(() => loading), here: () => here?.event ?? null, moment: () => moment };
+  window.review = { settled: () => queued.then(() => loading), here: () => current?.event ?? null, moment: () => moment };
 })();
