@@ -44,7 +44,7 @@ class McpCommand:
     rows: int = 200
     """The largest number of rows of a query, or of entries of a list, in an answer."""
     seconds: float = 60.0
-    """How long an answer may take."""
+    """The longest time for an answer, in seconds."""
 
     def run(self) -> None:
         """Serve until the client closes stdin."""

@@ -19,9 +19,9 @@ class NodeCommand:
     """Run an exported policy on a robot, as a ROS 2 lifecycle node.
 
     It starts unconfigured and in shadow mode: it reports the commands it would send, and sends
-    none. `ros2 lifecycle set /restock_policy configure`, then `activate`; or --activate. ROS
-    parameters follow --ros-args. With --on, ROS is not needed: a recording is played to the policy,
-    and its decisions are counted. See docs/deploy.md.
+    none. To start it, run `ros2 lifecycle set /restock_policy configure` and then `activate`, or
+    give --activate. ROS parameters follow --ros-args. With --on, ROS is not needed: a recording is
+    played to the policy, and its decisions are counted. See docs/deploy.md.
 
     Example: `restock-node policy.onnx --activate --ros-args -p use_sim_time:=true`
     """

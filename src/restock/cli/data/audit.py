@@ -58,12 +58,12 @@ class AuditCommand:
     second: Annotated[Path | None, Positional("[PANEL|RUN]")] = None
     """Also audit a panel that was made from the store, or the evaluation of a run."""
     third: Annotated[Path | None, Positional("[RUN]")] = None
-    """And the other of the two, in either order."""
+    """Also audit the other of panel and run; either may come first."""
     against: Annotated[str | None, Option("OLD")] = None
     """The earlier store, or an earlier version (store@41): everything it held must still be
     there."""
     baseline: Annotated[str | None, Option("planner|RUN|FILE.onnx")] = None
-    """The run must have passed `restock gate` against this, as it named it."""
+    """The run must have passed `restock gate` against this baseline, written as for the gate."""
     audits: Annotated[Path | None, Option("DIR")] = None
     """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
     thresholds: Annotated[Path | None, Option("FILE")] = None

@@ -23,7 +23,7 @@ class ExportCommand:
     is cut where rows are missing and becomes several. The data set records its provenance: store
     version, query or panel, task, counts. See docs/libraries.md. The policy of a run is the best
     one that it kept; the task is in the file's metadata. See docs/deploy.md. A folder of runs
-    becomes a run whose policy acts by the mean of theirs. See docs/train.md.
+    becomes a run whose policy acts by the mean of their action values. See docs/train.md.
     """
 
     source: Annotated[Path, Positional("SOURCE")]

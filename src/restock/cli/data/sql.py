@@ -47,7 +47,7 @@ class SqlCommand:
     """Beside a store: a panel or a run whose tables the query can also use, as panel.rows,
     run.audit, …"""
     third: Annotated[str | None, Positional("[RUN]")] = None
-    """And the other of the two, in either order."""
+    """Beside a store: the other of panel and run; either may come first."""
     query: Annotated[str | None, Positional("[QUERY]")] = None
     """The query, or - to read it from stdin. Default: open a prompt."""
     json: bool = False

@@ -40,10 +40,10 @@ class RecordCommand:
     """The recording to write: FILE.mcap (zstd), or a folder without an ending (rosbag2 with
     sqlite3)."""
     minutes: float | None = None
-    """Stop after the mission in which this much driving is recorded (default 5)."""
+    """Stop after the mission in which so many minutes of driving are recorded (default 5)."""
     missions: Annotated[str | None, Option("N|FILE")] = None
-    """Stop after this number of missions instead. Or drive the missions of a file by `restock
-    coverage gaps`, until the ordered number of missions has met each condition."""
+    """Stop after this number of missions instead. Or drive the missions of a file that `restock
+    coverage gaps` wrote, until the ordered number of missions has met each condition."""
     tag: Annotated[tuple[str, ...], Repeated("KEY=VALUE")] = ()
     """A tag of the recording, such as robot=amr-07. It is stored as a metadata record of the MCAP
     file, or as custom_data of the rosbag2 folder. May be given several times."""
