@@ -263,7 +263,7 @@ def show(outcome: IngestResult) -> None:
                     "frames kept": one["kept"],
                     "bytes": one["size_bytes"],
                     "thinned out": one["thinned"],
-                    "in force at no step": one["unused"],
+                    "used at no step": one["unused"],
                     "no image": sum(problem["count"] for problem in one["problems"]),
                     "steps with a frame": one["steps"],
                 }

@@ -91,7 +91,7 @@ class Work:
                 remedy="choose another --out",
             )
         if not plan:
-            expect_installed("the way to a policy", "torch", "mujoco", "altair")
+            expect_installed("training with a report", "torch", "mujoco", "altair")
             (out / FOLDER).mkdir(parents=True, exist_ok=True)
             self._save_records()
 

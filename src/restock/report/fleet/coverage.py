@@ -345,7 +345,7 @@ def drift_headline(drift: Drift) -> str:
             text += f", {signal_name(row)} {change_text(row)} since {row['since']}"
         return text
     if drift.findings:
-        return "No robot's hardware has changed enough to matter; how or where it drives has"
+        return "No robot's hardware has changed enough to matter; how or where robots drive has"
     return drift.without_findings()
 
 

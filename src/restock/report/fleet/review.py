@@ -238,7 +238,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             posted = msgspec.json.decode(body, type=_Post)
         except msgspec.MsgspecError as error:
-            self._send(400, json.dumps({"error": f"not what the page sends: {error}"}))
+            self._send(400, json.dumps({"error": f"the request is malformed: {error}"}))
             return
         if path == "verdicts":
             review.give(posted.entries)

@@ -434,7 +434,7 @@ def _evidence(cells: list[dict[str, Any]]) -> Section:
             ),
             f"{words(measure).capitalize()}: by how much the policy was better",
             "The bounds hold after every pair. The policy is shown not to be worse once the lower"
-            " one is above the tick, the margin.",
+            " bound is above the tick, which marks the margin.",
         )
         for measure in dict.fromkeys(cell["measure"] for cell in drawn)
     ]

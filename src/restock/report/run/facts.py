@@ -135,7 +135,7 @@ def gather(path: Path) -> Facts:
     if absent := run.absent:
         facts.missing.append(f"Missing tables, taken as empty: {', '.join(absent)}.")
     if not facts.cells and twin:
-        facts.missing.append("`restock eval` has not been run: success is of training only.")
+        facts.missing.append("`restock eval` has not been run: success is from training only.")
     _add_panel(facts)
     facts.floors = _floors(facts)
     facts.gap = _find_gap(facts)
