@@ -34,7 +34,7 @@ class CustomColumn:
 
     signal: CustomSignal
     values: Ragged  # (N,) for a signal that is not a list: one value per message, or none
-    unread: Sequence[str] = ()  # first text that is not a number, of each message with any
+    unread: Sequence[str] = ()  # a text that is not a number, of each message with any
     unmeasured: int = 0  # number of messages that mark it as not measured
 
     @cached_property

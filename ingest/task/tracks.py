@@ -29,7 +29,7 @@ from restock.state import Stateful
 
 SECTORS = 240  # sectors of bearing, 1.5 degrees each; the nearest return of each is kept
 AROUND = 3  # sectors to either side that a place is compared with: two beams of 5 degrees
-RANGE_M = 5.0  # range of tracking
+RANGE_M = 5.0  # nothing farther is tracked
 LAGS_S = (0.4, 1.0)  # ages of the earlier scans that a return is compared with
 FREE_M = 0.25  # a place was free if an earlier scan saw farther by more than this
 SAME_M = 0.2  # largest distance from an earlier return of the same object
