@@ -53,14 +53,14 @@ def train_on_panel(panel: Panel, run: Path, *, seed: int = 0, **options: Any) ->
         batches.append(buffer.sample(32).observations.numpy())
         if update % 10 == 0:
             names = ("nominal", "rare")
-            at_all = {"rows": 200, "td_abs_mean": 0.1, "td_online_abs_mean": 0.1, "q_lag": 0.05}
+            measured = {"rows": 200, "td_abs_mean": 0.1, "td_online_abs_mean": 0.1, "q_lag": 0.05}
             buffer.feed.evaluated(
                 [
                     {"condition": name, "episode_seed": one, "success": one % 2 > 0, "return": 1.0}
                     for name in names
                     for one in range(12)
                 ],
-                [{"condition": "rare", **at_all}, {"condition": "nominal", **at_all}],
+                [{"condition": "rare", **measured}, {"condition": "nominal", **measured}],
             )
     buffer.close()
     return batches
@@ -131,17 +131,17 @@ def test_fresh_steps_take_condition_from_info(panels: dict[str, Panel], tmp_path
     assert {"nominal", "rare"} <= fresh
 
 
-@pytest.mark.parametrize("lacking", ["target", "evaluation"])
+@pytest.mark.parametrize("missing", ["target", "evaluation"])
 def test_diagnosis_names_missing_record(
-    panels: dict[str, Panel], tmp_path: Path, lacking: str
+    panels: dict[str, Panel], tmp_path: Path, missing: str
 ) -> None:
-    if lacking == "target":
+    if missing == "target":
         train_on_panel(panels["quotas"], tmp_path / "run", settings={})
     else:
         buffer = MixtureReplayBuffer(9, *SPACES, panel=panels["quotas"], run=tmp_path / "run")
         buffer.sample(32)
         buffer.close()
-    with pytest.raises(RunError, match=lacking):
+    with pytest.raises(RunError, match=missing):
         diagnose([Run.open(tmp_path / "run")])
 
 

@@ -113,7 +113,7 @@ def _shuffle(values: Any) -> Any:
 
 
 def _tilt(held: Any, at: int) -> None:
-    held[:, at] += 0.1  # of 5 m/s2
+    held[:, at] += 0.1  # in units of 5 m/s2
 
 
 def _repeat_episodes(rows: FedRows, from_step: int = 0) -> FedRows:

@@ -25,11 +25,11 @@ from restock.train.prepare import prepare_new
 # Drivers of each step and the end of each episode.
 EPISODES = {
     "planner's own": (["planner"] * 3, "goal"),
-    "helped": (["planner", "operator", "planner"], "goal"),
-    "bumped": (["planner"] * 2, "bump"),
-    "cut": (["planner"] * 2, "cut"),
+    "operator intervened": (["planner", "operator", "planner"], "goal"),
+    "planner bumped": (["planner"] * 2, "bump"),
+    "planner truncated": (["planner"] * 2, "cut"),
     "operator's own": (["operator"] * 2, "cut"),
-    "another's": (["teleop"] * 2, "goal"),
+    "teleop's own": (["teleop"] * 2, "goal"),
 }
 
 
@@ -53,7 +53,7 @@ def rows_of_episodes() -> tuple[Coded, Coded, np.ndarray, np.ndarray]:
 def test_successes_exclude_episodes_with_teacher_steps() -> None:
     policy, episode, reward, discount = rows_of_episodes()
     found = rows_of_successes(policy, episode, reward, discount, ["operator"])
-    assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "another's"}
+    assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "teleop's own"}
     assert found.sum() == 5
     everyone = rows_of_successes(policy, episode, reward, discount, ["operator", "teleop"])
     assert {episode.name(row) for row in np.flatnonzero(everyone)} == {"planner's own"}

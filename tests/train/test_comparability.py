@@ -96,7 +96,7 @@ def test_planted_difference_is_found(planted, least, most) -> None:
 def test_shift_within_run_is_found() -> None:
     first, second = feed(1, runs=5), feed(2, runs=5)
     amounts = second.drawn.copy()
-    for tenth, times in ((0, 1.5), (9, 0.5)):  # early more slip, late less
+    for tenth, times in ((0, 1.5), (9, 0.5)):  # more slip early, less late
         shifted_rows = (second.tenth == tenth) & (second.cell == 1)
         amounts[shifted_rows] *= times
     shifted = Feed(

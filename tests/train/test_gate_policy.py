@@ -18,7 +18,7 @@ from restock.train.judge.gate import drive_gate, plan_gate
 from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 from restock.train.twin.physics.episode import EpisodeSpec
 
-Outcome = Callable[[EpisodeSpec, bool], bool]  # (mission, by the policy) -> success
+Outcome = Callable[[EpisodeSpec, bool], bool]  # (mission, is_agent) -> success
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
     """Return draws from 20 rows, each with its own stratum, condition and action."""
     rng = np.random.default_rng(seed)
     row = rng.integers(20, size=rows)
-    stratum, condition, action = row % 2, row // 2 % 2, row // 4 % 2  # "unmet" and "stop": never
+    stratum, condition, action = row % 2, row // 2 % 2, row // 4 % 2  # never "unmet" or "stop"
     requested = slice(rows // 2)
     return SourceRows(
         name="logs",
@@ -78,62 +78,64 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
 def test_sums_by_stratum_and_condition(rows: int, seed: int, greedy: bool) -> None:
-    of = source(rows, seed, greedy=greedy)
-    strata = sampled_rows.strata(of, np.array([rows, 0, 0]))
-    weight = of.rows["weight"].astype(np.float64)
+    draws = source(rows, seed, greedy=greedy)
+    strata = sampled_rows.strata(draws, np.array([rows, 0, 0]))
+    weight = draws.rows["weight"].astype(np.float64)
     for code in range(len(STRATA)):
-        mine = of.stratum == code
+        mine = draws.stratum == code
         assert strata["drawn_rows"][code] == mine.sum()
-        assert strata["unique_rows"][code] == len(set(of.row[mine].tolist()))
+        assert strata["unique_rows"][code] == len(set(draws.row[mine].tolist()))
         share = strata["effective_share"][code]
         assert share == pytest.approx(weight[mine].sum() / weight.sum())
         if not mine.any():
             assert strata["td_abs_mean"][code] is None
             continue
         for name, values in (
-            ("td_abs_mean", np.abs(of.rows["td"])),
-            ("q_mean", of.rows["q"]),
-            ("reward_mean", of.rows["reward"]),
-            ("terminal_share", of.rows["discount"] == 0),
+            ("td_abs_mean", np.abs(draws.rows["td"])),
+            ("q_mean", draws.rows["q"]),
+            ("reward_mean", draws.rows["reward"]),
+            ("terminal_share", draws.rows["discount"] == 0),
         ):
             assert strata[name][code] == pytest.approx(values[mine].mean(), abs=1e-6)
-    conditions = sampled_rows.conditions(of)
-    observed = Counter(CONDITIONS[code] for code in of.condition.tolist())
+    conditions = sampled_rows.conditions(draws)
+    observed = Counter(CONDITIONS[code] for code in draws.condition.tolist())
     assert dict(zip(conditions["condition"], conditions["drawn_rows"], strict=True)) == observed
 
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99))
 def test_episode_draws_by_stratum_and_condition(rows: int, seed: int) -> None:
-    of = source(rows, seed, greedy=False)
-    columns = sampled_rows.sampled_episodes(of)
+    draws = source(rows, seed, greedy=False)
+    columns = sampled_rows.sampled_episodes(draws)
     cells = zip(columns["episode"], columns["stratum"], columns["condition"], strict=True)
     found = dict(zip(cells, columns["drawn_rows"].tolist(), strict=True))
     counted: Counter[tuple[str, str, str]] = Counter(
         (str(episode), STRATA[stratum], CONDITIONS[condition])
-        for episode, stratum, condition in zip(of.episode, of.stratum, of.condition, strict=True)
+        for episode, stratum, condition in zip(
+            draws.episode, draws.stratum, draws.condition, strict=True
+        )
     )
     assert found == counted
-    assert columns["weight"].sum() == pytest.approx(of.rows["weight"].sum(), rel=1e-5)
+    assert columns["weight"].sum() == pytest.approx(draws.rows["weight"].sum(), rel=1e-5)
 
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
 def test_undrawn_actions_have_rows(rows: int, seed: int, greedy: bool) -> None:
-    of = source(rows, seed, greedy=greedy)
-    columns = sampled_rows.actions(of, ACTIONS)
+    draws = source(rows, seed, greedy=greedy)
+    columns = sampled_rows.actions(draws, ACTIONS)
     cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))
-    observed = {(int(s), int(c)) for s, c in zip(of.stratum, of.condition, strict=True)}
+    observed = {(int(s), int(c)) for s, c in zip(draws.stratum, draws.condition, strict=True)}
     assert cells == [
         (STRATA[s], CONDITIONS[c], action) for s, c in sorted(observed) for action in ACTIONS
     ]
     for place, (stratum, condition, action) in enumerate(cells):
-        pair = of.stratum == STRATA.index(stratum)
-        pair &= of.condition == CONDITIONS.index(condition)
-        mine = pair & (of.rows["action"] == ACTIONS.index(action))
+        pair = draws.stratum == STRATA.index(stratum)
+        pair &= draws.condition == CONDITIONS.index(condition)
+        mine = pair & (draws.rows["action"] == ACTIONS.index(action))
         assert columns["drawn_rows"][place] == mine.sum()
         assert columns["drawn_share"][place] == mine.sum() / pair.sum()
-        assert columns["unique_rows"][place] == len(set(of.row[mine].tolist()))
+        assert columns["unique_rows"][place] == len(set(draws.row[mine].tolist()))
         if greedy:
             requested = pair[: rows // 2].sum()
             assert columns["audited_rows"][place] == requested

@@ -323,7 +323,7 @@ def test_kept_policy_averages_weights(monkeypatch):
         for _ in range(6):
             learner.update(rows)
             seen.append(learner.network.advantage.bias.detach().clone())
-        # The mean of the first four, then a quarter of the way to each further one.
+        # The mean of the first four, then an exponential average with rate .25.
         expected = seen[-1]
         if rate == 0.25:
             expected = torch.stack(seen[:4]).mean(dim=0)

@@ -148,10 +148,10 @@ def test_environment_variable_disables_native_code(value, used, monkeypatch):
     assert done.stdout.split() == [str(used)] * 2, done.stderr
 
 
-@pytest.mark.parametrize("way", ["asked for", "not compiled"])
-def test_pytorch_is_used_without_native_code(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    absent = "sys.modules['restock._native'] = None" if way == "not compiled" else ""
-    monkeypatch.setenv(native.SWITCH, "0" if way == "asked for" else "1")
+@pytest.mark.parametrize("reason", ["disabled", "not compiled"])
+def test_pytorch_is_used_without_native_code(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    absent = "sys.modules['restock._native'] = None" if reason == "not compiled" else ""
+    monkeypatch.setenv(native.SWITCH, "0" if reason == "disabled" else "1")
     probe = f"""
 import sys
 {absent}
@@ -174,12 +174,12 @@ main(["--version"])
 @compiled
 def test_gradients_of_two_forward_passes_add_up() -> None:
     held = network((16, 16), layer_norm=True)
-    theirs = clone(held).requires_grad_()
-    ours = make_kernel(held)
+    autograd = clone(held).requires_grad_()
+    kernel = make_kernel(held)
     first, second = normal(5, OBSERVATION, seed=1), normal(9, OBSERVATION, seed=2)
-    (ours(first).square().mean() + ours(second).square().mean()).backward()
-    (theirs(first).square().mean() + theirs(second).square().mean()).backward()
-    for one, other in zip(held.parameters(), theirs.parameters(), strict=True):
+    (kernel(first).square().mean() + kernel(second).square().mean()).backward()
+    (autograd(first).square().mean() + autograd(second).square().mean()).backward()
+    for one, other in zip(held.parameters(), autograd.parameters(), strict=True):
         torch.testing.assert_close(one.grad, other.grad, rtol=1e-4, atol=1e-5)
 
 
@@ -188,15 +188,18 @@ def test_gradients_of_two_forward_passes_add_up() -> None:
 @pytest.mark.parametrize("double", [True, False])
 def test_native_update_is_bit_identical_to_autograd(source, double, monkeypatch):
     settings = {"teacher": {"source": source}, "loss": {"double": double, "huber_delta": 0.5}}
-    ours, theirs = (Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2))
-    theirs._has_kernels = False
+    learner, reference = (
+        Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2)
+    )
+    reference._has_kernels = False
     for seed, weight in ((1, None), (2, normal(37, seed=5).abs()), (3, None)):
         rows, labels = normal(37, 17, seed=seed), torch.arange(37) % 5 - 1
         rows[:, 14] = torch.arange(37) % 4
         labelled = behaviour.Labelled(rows[:, 3:10], labels)
         given = {"weight": weight, "logged": 9, "labelled": labelled}
-        loss = ours.update(rows, **given)
+        loss = learner.update(rows, **given)
         monkeypatch.setattr(behaviour, "Kernel", Learner)  # not its class
-        expected = theirs.update(rows, **given)
+        expected = reference.update(rows, **given)
         monkeypatch.undo()
-        assert all(map(torch.equal, [loss.value, *ours.moved], [expected.value, *theirs.moved]))
+        assert all(map(torch.equal, [loss.value, *learner.moved], [expected.value, *reference.moved]))
+        )

@@ -17,12 +17,12 @@ EXAMPLE = ROOT / "docs/examples/qr_dqn.py"
 def test_qr_dqn_example_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLE.parent))
     assert len(EXAMPLE.read_text().splitlines()) <= 150
-    one = run_to_end(tmp_path / "run", config(loss={"algorithm": "qr_dqn:QRDQN"}))
-    assert one.learner.gradient_steps > 300
+    live = run_to_end(tmp_path / "run", config(loss={"algorithm": "qr_dqn:QRDQN"}))
+    assert live.learner.gradient_steps > 300
     observation = torch.eye(TASK.observation_size)[: CELLS - 1]
-    quantiles = one.learner.policy.quantiles(observation)  # type: ignore[operator, union-attr]
+    quantiles = live.learner.policy.quantiles(observation)  # type: ignore[operator, union-attr]
     assert quantiles.shape == (CELLS - 1, 3, 32)
-    forward = one.learner.policy(observation).argmax(dim=1) == 1
+    forward = live.learner.policy(observation).argmax(dim=1) == 1
     assert forward.float().mean() > 0.5
 
 

@@ -53,55 +53,55 @@ def test_proposal_reader_returns_nearest_action(seed: int) -> None:
     assert ((observation @ says) == known).all()
 
 
-def learner(margin: float, *, path: str | None = None) -> Learner:
+def make_planner_learner(margin: float, *, path: str | None = None) -> Learner:
     document = {"teacher": {"source": "planner", "margin": margin}}
     document["network"] = {"hidden": [16]}
     return make_learner(parse_config(document, where="test"), TASK, path=path)
 
 
-def set_q(one: Learner, q: list[float]) -> None:
+def set_q(learner: Learner, q: list[float]) -> None:
     """Make Q equal to `q` (A,) in every state."""
-    for network in (one.network, one.target_network, one.policy_network):
+    for network in (learner.network, learner.target_network, learner.policy_network):
         with torch.no_grad():
             network.advantage.weight.zero_()
             network.advantage.bias.copy_(tensor(q))
 
 
 def test_policy_deviates_only_beyond_the_margin() -> None:
-    one = learner(0.3)
+    learner = make_planner_learner(0.3)
     command = np.asarray(TASK.actions)  # every action is proposed once
     observation = observations_of(command, np.ones(len(command), np.bool_))
-    set_q(one, [0.0, 0.25, *[0.0] * (len(command) - 2)])
-    assert one.greedy(observation).tolist() == list(range(len(command)))
-    set_q(one, [0.0, 0.35, *[0.0] * (len(command) - 2)])
-    assert one.greedy(observation).tolist() == [1] * len(command)
-    set_q(one, [0.0, 0.05, *[0.0] * (len(command) - 2)])
+    set_q(learner, [0.0, 0.25, *[0.0] * (len(command) - 2)])
+    assert learner.greedy(observation).tolist() == list(range(len(command)))
+    set_q(learner, [0.0, 0.35, *[0.0] * (len(command) - 2)])
+    assert learner.greedy(observation).tolist() == [1] * len(command)
+    set_q(learner, [0.0, 0.05, *[0.0] * (len(command) - 2)])
     unknown = observations_of(command, np.zeros(len(command), np.bool_))
-    assert one.greedy(unknown).tolist() == [1] * len(command)  # without a proposal, Q decides
+    assert learner.greedy(unknown).tolist() == [1] * len(command)  # without a proposal, Q decides
 
 
 @pytest.mark.parametrize("path", ["native", "autograd"])
 def test_td_target_uses_action_of_filtered_policy(path: str) -> None:
-    one = learner(0.3, path=path)
-    set_q(one, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
+    learner = make_planner_learner(0.3, path=path)
+    set_q(learner, [1.0, 1.2, *[0.5] * (len(TASK.actions) - 2)])
     after = observations_of(np.array([[0.0, 0.0], TASK.actions[2]]), np.ones(2, np.bool_))
     scalars = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]], np.float32)
     rows = torch.from_numpy(np.concatenate([after, after, scalars], axis=1))
-    td, _, _ = one.td_error(rows)
+    td, _, _ = learner.td_error(rows)
     # Row 0 keeps the proposed action 0 (1 is better by only .2); row 1 deviates from 2 to 1 (.7).
     assert td.tolist() == pytest.approx([1.0 - 0.5 * 1.0, 1.0 - 0.5 * 1.2])
 
 
 def test_constant_q_follows_the_planner() -> None:
-    one = learner(0.3)
-    set_q(one, [0.0] * len(TASK.actions))
+    learner = make_planner_learner(0.3)
+    set_q(learner, [0.0] * len(TASK.actions))
     env = WarehouseVectorEnv(8, seed=3)
     observation, _ = env.reset(seed=3)
     planner = PlannerFollower(epsilon=0.0)
     taken = []
     for _ in range(60):
         wanted = planner.choose(env)
-        found = one.greedy(observation)
+        found = learner.greedy(observation)
         assert (found == wanted).all()
         taken += found.tolist()
         observation, *_ = env.step(found)
@@ -122,7 +122,7 @@ def make_kept_run(path, seed, **teacher):
 
 
 def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None:
-    one, other = (
+    first, second = (
         make_kept_run(tmp_path / "runs" / name, seed, source="planner", margin=0.3)
         for seed, name in enumerate("ab")
     )
@@ -133,7 +133,7 @@ def test_mean_of_runs_has_a_smaller_margin(tmp_path: Path, shell: Shell) -> None
     made = load_agent(run)
     observation = torch.from_numpy(observations_of(np.asarray(TASK.actions), np.arange(10) > 4))
     with torch.no_grad():
-        mean = (one.network.values(observation) + other.network.values(observation)) / 2
+        mean = (first.network.values(observation) + second.network.values(observation)) / 2
         torch.testing.assert_close(made.network.values(observation), mean)
         margin = (made.network(observation) - mean).amax(dim=1)
     torch.testing.assert_close(margin, torch.where(torch.arange(10) > 4, 0.3 / 2**0.5, 0.0))

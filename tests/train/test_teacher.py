@@ -52,7 +52,7 @@ def test_imitation_loss_skips_unlabelled_states() -> None:
     assert float(imitation_loss(logits, torch.full((3,), UNKNOWN))) == 0
 
 
-def learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
+def make_teacher_learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
     document: dict[str, Any] = {"network": {"hidden": (16,)}, "teacher": {"source": "logs"}}
     document |= sections
     return Learner(parse_config(document, where="test"), 6, 3, path=path)
@@ -66,19 +66,19 @@ def rows(seed: int) -> Tensor:
 
 
 def test_implausible_actions_are_not_chosen_or_bootstrapped() -> None:
-    one = learner()
-    behaviour = one.behaviour
+    learner = make_teacher_learner()
+    behaviour = learner.behaviour
     assert behaviour is not None
     state = torch.eye(6)
     for _ in range(200):
         behaviour.learn(Labelled(state, torch.full((6,), FORWARD)))
     assert behaviour.preference(state).tolist() == [[-np.inf, 0, -np.inf]] * 6
     with torch.no_grad():
-        one.network.advantage.bias.copy_(tensor([9.0, 0.0, 5.0]))
-    assert greedy_actions(one.network, state.numpy()).tolist() == [STOP] * 6
-    assert one.greedy(state.numpy()).tolist() == [FORWARD] * 6
-    unfiltered = learner(teacher={"source": "logs", "ratio": 0.0})
-    unfiltered.load_state_dict(one.state_dict())
+        learner.network.advantage.bias.copy_(tensor([9.0, 0.0, 5.0]))
+    assert greedy_actions(learner.network, state.numpy()).tolist() == [STOP] * 6
+    assert learner.greedy(state.numpy()).tolist() == [FORWARD] * 6
+    unfiltered = make_teacher_learner(teacher={"source": "logs", "ratio": 0.0})
+    unfiltered.load_state_dict(learner.state_dict())
     assert unfiltered.greedy(state.numpy()).tolist() == [STOP] * 6
 
 

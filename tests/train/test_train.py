@@ -122,7 +122,7 @@ def test_unfillable_quota_is_warned_about(tmp_path, capsys, shell):
     assert slip["short_share"] > 0.3
 
 
-@pytest.mark.long  # test_loop shows it on the corridor
+@pytest.mark.long  # test_loop.py checks it on the corridor
 def test_resume_in_twin_is_bit_exact(tmp_path, panel, shell):
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0

@@ -65,17 +65,19 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def test_blocks_match_single_updates(variant: str, device: str, tmp_path: Path) -> None:
     """Compare sampled rows bit for bit, and weights up to rounding."""
     changes = {**VARIANTS[variant], "schedule": OFFLINE}
-    one = run_to_end(tmp_path / "one", config(**changes))
+    single = run_to_end(tmp_path / "one", config(**changes))
     blocks = train_and_close(in_blocks(tmp_path / "blocks", device, **changes))
-    assert blocks.learner.gradient_steps == one.learner.gradient_steps == OFFLINE["offline_updates"]
-    assert blocks.learner.target.last_sync == one.learner.target.last_sync
+    assert (
+        blocks.learner.gradient_steps == single.learner.gradient_steps == OFFLINE["offline_updates"]
+    )
+    assert blocks.learner.target.last_sync == single.learner.target.last_sync
     for name in ("network", "target_network", "policy"):
-        expected = getattr(one.learner, name).state_dict()
+        expected = getattr(single.learner, name).state_dict()
         for key, value in getattr(blocks.learner, name).state_dict().items():
             np.testing.assert_allclose(
                 value.cpu(), expected[key], rtol=2e-3, atol=2e-4, err_msg=f"{name} {key}"
             )
-    fed, expected_fed = tables(blocks.run.path), tables(one.run.path)
+    fed, expected_fed = tables(blocks.run.path), tables(single.run.path)
     rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "weight", "reward"]
     assert fed["audit"].select(rows).equals(expected_fed["audit"].select(rows))
     assert len(fed["audit"]) > 0
@@ -85,12 +87,12 @@ def test_blocks_match_single_updates(variant: str, device: str, tmp_path: Path) 
 def test_online_run_in_blocks_matches_single_updates(tmp_path: Path) -> None:
     """Compare the ring, the weights and all tables of an online run."""
     short = {"schedule": {"env_steps": 800}}
-    one = run_to_end(tmp_path / "one", config(**short))
+    single = run_to_end(tmp_path / "one", config(**short))
     blocks = train_and_close(in_blocks(tmp_path / "blocks", "cpu", **short))
-    for name, value in one.learner.policy.state_dict().items():
+    for name, value in single.learner.policy.state_dict().items():
         assert torch.equal(value, blocks.learner.policy.state_dict()[name]), name
-    np.testing.assert_array_equal(one.ring.rows, blocks.ring.rows)
-    fed, expected = tables(blocks.run.path), tables(one.run.path)
+    np.testing.assert_array_equal(single.ring.rows, blocks.ring.rows)
+    fed, expected = tables(blocks.run.path), tables(single.run.path)
     for name in expected.keys() - POLICY_TABLES:
         assert fed[name].equals(expected[name]), name
     audit = [name for name in expected["audit"].column_names if name != "greedy_action"]
@@ -116,11 +118,11 @@ def test_priorities_feed_blocks_like_single_updates(device, tmp_path):
     table = recording_transitions(1, task=TASK)
     built = panel_of(table, text, tmp_path / "panel", task=TASK, conditions=CONDITIONS)
     changes = {"schedule": {"env_steps": 200, "warmup_env_steps": 40, "offline_updates": 40}}
-    one = run_to_end(tmp_path / "one", config(**changes), logs=Logs.of_panel(built))
+    single = run_to_end(tmp_path / "one", config(**changes), logs=Logs.of_panel(built))
     live = in_blocks(tmp_path / "blocks", device, logs=Logs.of_panel(built), **changes)
     assert live.batches.needs_td
     blocks = train_and_close(live)
-    fed, expected = tables(blocks.run.path)["audit"], tables(one.run.path)["audit"]
+    fed, expected = tables(blocks.run.path)["audit"], tables(single.run.path)["audit"]
     of_logs = [table.filter(pc.equal(table["source"], "logs")) for table in (fed, expected)]
     rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "reward"]
     assert len(of_logs[0]) == len(of_logs[1]) > 0

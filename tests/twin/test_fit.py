@@ -275,7 +275,7 @@ def test_other_robot_rejects_stand_in_parameters(tmp_path: Path) -> None:
 def test_all_parameters_of_known_robot_are_recovered(tmp_path: Path) -> None:
     true = msgspec.structs.replace(
         KNOWN,
-        friction_scale=0.275,  # of .8: .22
+        friction_scale=0.275,  # times .8: .22
         payload_kg=60.0,
         track_scale=1.02,
         latency_s=0.13,

@@ -120,8 +120,8 @@ def test_acceleration_matches_friction(friction: float) -> None:
 
 @pytest.mark.parametrize("friction", [0.05, 0.1, 0.2])
 def test_starting_slip_matches_coulomb_friction(friction: float) -> None:
-    # The wheels follow the ramp of 4 m/s2 to 1 m/s: 1 - 1 / 8 m in a second. The floor gives
-    # a = mu g share: the robot comes a / 2 m far, or 1 - 1 / (2 a) where it reaches 1 m/s.
+    # The wheels follow the ramp of 4 m/s2 to 1 m/s: 1 - 1 / 8 m in a second. Friction gives
+    # a = mu g share: the robot moves a / 2 m, or 1 - 1 / (2 a) m if it reaches 1 m/s.
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
     sim.friction.set_floor(0, friction)
@@ -134,7 +134,7 @@ def test_starting_slip_matches_coulomb_friction(friction: float) -> None:
 
 
 def test_yaw_acceleration_matches_split_friction() -> None:
-    # Both wheels spin: mu N / 2 each, on arms of half a track, turn the robot about its centre.
+    # Both wheels spin: forces mu N / 2, on arms of half a track, turn the robot about its centre.
     floor, left = 0.1, 0.5
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(left_friction_scale=left, **QUIET))

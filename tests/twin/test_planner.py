@@ -28,7 +28,7 @@ def test_plans_avoid_racks_and_end_at_goal() -> None:
 
 def test_plan_length_is_near_shortest() -> None:
     # Aisle 1 west to aisle 3 east through the middle cross-aisle: 2.95 + 5.47 + 2.55 by right
-    # angles; cutting corners may save some of it, nothing may add to it.
+    # angles, which cut corners shorten.
     plan = PLANNER.plan(3.0, 0.9, (8.5, 6.37))
     assert np.hypot(5.5, 5.47) < length_m(plan) < 5.5 + 5.47
 

@@ -310,4 +310,4 @@ def test_rendered_map_shows_robot() -> None:
     assert frame.shape == (400, 480, 3)
     x, y, _ = made.simulation.pose()[0]
     row, column = 400 - 1 - int(y * 40), int(x * 40)
-    assert frame[row, column].tolist() == [240, 130, 30]  # orange, where the robot is
+    assert frame[row, column].tolist() == [240, 130, 30]  # orange: the robot

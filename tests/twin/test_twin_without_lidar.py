@@ -27,7 +27,7 @@ def drive(task):
         observation, reward, terminated, truncated, _ = env.step(np.array([2, 1 + step % 3]))
         seen.append(observation)
         earned.append(reward)
-        over.append(terminated | truncated)  # then the signals are of the next episode
+        over.append(terminated | truncated)  # the signals are then of the next episode
         tight.append(env.signals["clearance_m"] < task.rewards.tight_clearance_m)
     env.close()
     went_on = ~np.array(over)
