@@ -150,35 +150,34 @@ def _cut_episodes(rows: FedRows) -> FedRows:
 
 
 PLANTED: dict[str, tuple[Plant, str]] = {
-    "a gyroscope in degrees": (lambda rows: _change_gyroscope(rows, 180 / np.pi), "SENSOR_SCALED"),
-    "a gyroscope with a bias": (lambda rows: _change_gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
-    "a heading 8 degrees off": (lambda r: _add_entry(r, "lateral_speed", "localised_speed", 0.14),
-                                "SENSOR_TURNED"),
-    "a pose .2 m ahead of the centre": (
+    "gyroscope in degrees": (lambda rows: _change_gyroscope(rows, 180 / np.pi), "SENSOR_SCALED"),
+    "gyroscope with a bias": (lambda rows: _change_gyroscope(rows, 1, 0.1), "SENSOR_BIASED"),
+    "heading 8 degrees off": (
+        lambda r: _add_entry(r, "lateral_speed", "localised_speed", 0.14), "SENSOR_TURNED"),
+    "pose .2 m ahead of the centre": (
         lambda rows: _add_entry(rows, "lateral_speed", "gyro_yaw_rate", 0.2), "SENSOR_OFF_CENTRE"),
-    "an inertial unit that is tilted": (lambda rows: _change_entries(rows, _tilt, "accel_x"),
-                                        "SENSOR_BIASED"),
-    "one robot's pieces again": (lambda r: _repeat_episodes(r, from_step=10), "EPISODES_REPEATED"),
-    "a lidar's ranges halved": (lambda r: _change_lidar(r, lambda seen: seen / 2), "LIDAR_SCALED"),
-    "left and right in half of the rows": (
+    "tilted IMU": (lambda rows: _change_entries(rows, _tilt, "accel_x"), "SENSOR_BIASED"),
+    "parts of episodes repeated": (
+        lambda r: _repeat_episodes(r, from_step=10), "EPISODES_REPEATED"),
+    "lidar ranges halved": (lambda r: _change_lidar(r, lambda seen: seen / 2), "LIDAR_SCALED"),
+    "left and right exchanged in half of the rows": (
         lambda r: _set_actions(
             r, np.where(_shuffle(r.step % 2 > 0), _mirror_turns(r).action, r.action)),
         "ACTIONS_MIXED"),
-    "left and right": (_mirror_turns, "ACTIONS_MIRRORED"),
+    "left and right exchanged": (_mirror_turns, "ACTIONS_MIRRORED"),
     "actions .4 s late": (_delay_actions, "ACTIONS_SHIFTED"),
-    "actions changed after ingest": (lambda rows: replace(rows, action=_mirror_turns(rows).action),
-                                     "ACTIONS_CHANGED"),
-    "rewards twice": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
+    "actions changed after ingest": (
+        lambda rows: replace(rows, action=_mirror_turns(rows).action), "ACTIONS_CHANGED"),
+    "rewards doubled": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
     "rewards of other rows": (lambda rows: replace(rows, reward=_shuffle(rows.reward)), "REWARD_"),
-    "terminations": (lambda rows: replace(rows, terminated=rows.terminated & False),
-                     "TERMINATIONS_LOST"),
+    "terminations removed": (
+        lambda rows: replace(rows, terminated=rows.terminated & False), "TERMINATIONS_LOST"),
     "time-outs as terminations": (_cut_episodes, "TERMINATIONS_WRONG"),
     "next observations of other rows": (
-        lambda rows: replace(rows, next_observation=_shuffle(rows.next_observation)),
-        "ROWS_APART"),
-    "observations of the step after": (
+        lambda rows: replace(rows, next_observation=_shuffle(rows.next_observation)), "ROWS_APART"),
+    "observations of the next step": (
         lambda rows: replace(rows, observation=rows.next_observation), "FUTURE_IN_OBSERVATION"),
-    "episodes twice": (_repeat_episodes, "EPISODES_REPEATED"),
+    "episodes repeated": (_repeat_episodes, "EPISODES_REPEATED"),
 }  # fmt: skip
 
 
@@ -284,17 +283,23 @@ def _plant_in_one_robot(rows: FedRows, plant: Plant) -> FedRows:
 
 OF_ONE: dict[str | None, tuple[Plant, str]] = {
     None: (lambda rows: rows, ""),
-    "wheels": (lambda rows: _add_entry(rows, "wheel_speed", "wheel_speed", -0.08),
-               "the scale of the logs' wheels (speed) is 0.92"),
-    "short": (lambda rows: _change_lidar(rows, lambda seen: seen - 0.25), "lidar differ by -0.2"),
-    "blind": (lambda rows: _change_lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
-              "racks and walls in 25% of its sectors (degrees from ahead: -175,"),
-    "elsewhere": (lambda r: replace(r, pose=r.pose + np.outer(r.episode % 2, [1, 1, 0])),
-                  "lidar does not see the racks that should be near the pose"),
-    "drivers": (lambda rows: replace(rows, driver=_alternate_drivers(rows, "operator", "planner")),
-                "driven like another policy"),
-    "lost": (lambda rows: replace(rows, counted=np.add(rows.counted, [40, 0])),
-             "of the rows that ingest wrote for these recordings are gone"),
+    "scaled wheels": (
+        lambda rows: _add_entry(rows, "wheel_speed", "wheel_speed", -0.08),
+        "the scale of the logs' wheels (speed) is 0.92"),
+    "short lidar ranges": (
+        lambda rows: _change_lidar(rows, lambda seen: seen - 0.25), "lidar differ by -0.2"),
+    "blind lidar sectors": (
+        lambda rows: _change_lidar(rows, lambda seen: np.where(np.arange(36) < 9, 4.0, seen)),
+        "racks and walls in 25% of its sectors (degrees from ahead: -175,"),
+    "shifted pose": (
+        lambda r: replace(r, pose=r.pose + np.outer(r.episode % 2, [1, 1, 0])),
+        "lidar does not see the racks that should be near the pose"),
+    "exchanged drivers": (
+        lambda rows: replace(rows, driver=_alternate_drivers(rows, "operator", "planner")),
+        "driven like another policy"),
+    "lost rows": (
+        lambda rows: replace(rows, counted=np.add(rows.counted, [40, 0])),
+        "of the rows that ingest wrote for these recordings are gone"),
 }  # fmt: skip
 
 
@@ -384,34 +389,42 @@ def _split_episodes(rows: FedRows) -> FedRows:
 
 PART_OF: dict[str | None, tuple[Plant, str]] = {
     None: (lambda rows: rows, ""),
-    "saturated": (lambda r: _change_entries(r, _clip, "wheel_speed"),
-                  "wheels (speed) is never beyond 0.5"),
-    "rounded": (lambda r: _change_series(r, "wheel_speed", lambda one: np.round(one, 1)),
-                "wheels (speed) has few different values"),
-    "zeros": (lambda r: _change_series(r, "wheel_speed",
-                                       lambda one: one * (np.arange(len(r)) % 9 > 0)),
-              "wheels (speed) reads 0 in 11%"),
-    "held": (lambda r: _change_series(r, "wheel_speed",
-                                lambda one: one[np.arange(len(r)) - np.arange(len(r)) % 4]),
-             "wheels (speed) keeps its value in 7"),
-    "late": (lambda r: _change_series(r, "wheel_speed",
-                                lambda one: np.where(r.episode % 8 < 4, np.roll(one, 5), one)),
-             "wheels (speed) is 1 s (5 steps) late"),
-    "jumps": (lambda r: _change_series(r, "localised_speed",
-                                 lambda one: one + 2.5 * (r.step % 20 == 9)),
-              "the logs' pose has single values that are far off"),
-    "copied": (_copy_command, "wheels (speed) are exactly the command"),
-    "opposite": (lambda r: _change_gyroscope(r, np.where(r.episode % 8 < 4, -1.0, 1.0)),
-                 "the sign of the logs' gyroscope is opposite"),
-    "not held": (_hold_wrong_values, "the logs' gyroscope does not follow"),
-    "no returns": (lambda r: _change_lidar(r, _drop_returns), "the logs' lidar reads 0"),
-    "goals": (_cut_at_new_goals, "another goal is in force before the goal is reached"),
-    "proposals": (_follow_proposals, "of the actions of 'planner' are navigation's proposals"),
-    "ends again": (_repeat_at_ends, "it repeats the row's own observation"),
-    "rewards": (lambda r: replace(r, reward=np.where(r.step % 3, r.reward, np.roll(r.reward, 1))),
-                "are not exactly the task's rewards"),
-    "ends": (_continue_at_ends, "the last next observation does not follow from its row"),
-    "split": (_split_episodes, "stop where another episode begins"),
+    "saturated wheel speed": (
+        lambda r: _change_entries(r, _clip, "wheel_speed"), "wheels (speed) is never beyond 0.5"),
+    "rounded wheel speed": (
+        lambda r: _change_series(r, "wheel_speed", lambda one: np.round(one, 1)),
+        "wheels (speed) has few different values"),
+    "zero wheel speed": (
+        lambda r: _change_series(r, "wheel_speed", lambda one: one * (np.arange(len(r)) % 9 > 0)),
+        "wheels (speed) reads 0 in 11%"),
+    "held wheel speed": (
+        lambda r: _change_series(
+            r, "wheel_speed", lambda one: one[np.arange(len(r)) - np.arange(len(r)) % 4]),
+        "wheels (speed) keeps its value in 7"),
+    "late wheel speed": (
+        lambda r: _change_series(
+            r, "wheel_speed", lambda one: np.where(r.episode % 8 < 4, np.roll(one, 5), one)),
+        "wheels (speed) is 1 s (5 steps) late"),
+    "jumps of the pose": (
+        lambda r: _change_series(r, "localised_speed", lambda one: one + 2.5 * (r.step % 20 == 9)),
+        "the logs' pose has single values that are far off"),
+    "wheel speed is the command": (_copy_command, "wheels (speed) are exactly the command"),
+    "opposite sign": (
+        lambda r: _change_gyroscope(r, np.where(r.episode % 8 < 4, -1.0, 1.0)),
+        "the sign of the logs' gyroscope is opposite"),
+    "wrong gyroscope values": (_hold_wrong_values, "the logs' gyroscope does not follow"),
+    "lidar without returns": (lambda r: _change_lidar(r, _drop_returns), "the logs' lidar reads 0"),
+    "goals replaced early": (
+        _cut_at_new_goals, "another goal is in force before the goal is reached"),
+    "actions are proposals": (
+        _follow_proposals, "of the actions of 'planner' are navigation's proposals"),
+    "observation repeated at ends": (_repeat_at_ends, "it repeats the row's own observation"),
+    "rewards of the previous row": (
+        lambda r: replace(r, reward=np.where(r.step % 3, r.reward, np.roll(r.reward, 1))),
+        "are not exactly the task's rewards"),
+    "next episode at ends": (
+        _continue_at_ends, "the last next observation does not follow from its row"),
+    "split episodes": (_split_episodes, "stop where another episode begins"),
 }  # fmt: skip
 
 

@@ -188,10 +188,8 @@ def test_gradients_of_two_forward_passes_add_up() -> None:
 @pytest.mark.parametrize("double", [True, False])
 def test_native_update_is_bit_identical_to_autograd(source, double, monkeypatch):
     settings = {"teacher": {"source": source}, "loss": {"double": double, "huber_delta": 0.5}}
-    learner, reference = (
-        Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2)
-    )
-    reference._has_kernels = False
+    learner, oracle = (Learner(parse_config(settings, where="test"), 7, 4) for _ in range(2))
+    oracle._has_kernels = False
     for seed, weight in ((1, None), (2, normal(37, seed=5).abs()), (3, None)):
         rows, labels = normal(37, 17, seed=seed), torch.arange(37) % 5 - 1
         rows[:, 14] = torch.arange(37) % 4
@@ -199,7 +197,6 @@ def test_native_update_is_bit_identical_to_autograd(source, double, monkeypatch)
         given = {"weight": weight, "logged": 9, "labelled": labelled}
         loss = learner.update(rows, **given)
         monkeypatch.setattr(behaviour, "Kernel", Learner)  # not its class
-        expected = reference.update(rows, **given)
+        expected = oracle.update(rows, **given)
         monkeypatch.undo()
-        assert all(map(torch.equal, [loss.value, *learner.moved], [expected.value, *reference.moved]))
-        )
+        assert all(map(torch.equal, [loss.value, *learner.moved], [expected.value, *oracle.moved]))
