@@ -291,7 +291,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
             panel.header.files[name].check(path / name, verify=True)
             read_parquet(connection, view, [path / name], schema=schema)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
-        _keep(connection, schema, "strata", strata)
+        _create_table(connection, schema, "strata", strata)
         return "panel"
     tables = sorted(path.glob("*.parquet"))
     if not tables or not (path / RUN_CONFIG).is_file():
@@ -320,7 +320,7 @@ def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: 
         "action": pa.array(range(len(names)), pa.int16()),
         "name": pa.array(names, pa.string()),
     }
-    _keep(connection, schema, "action_names", pa.table(table))
+    _create_table(connection, schema, "action_names", pa.table(table))
     text = resources.files("restock.replay").joinpath("replay_audit.sql").read_text("utf-8")
     connection.execute(text.replace("{schema}", schema))
 
@@ -334,7 +334,9 @@ def _add_returns(connection: duckdb.DuckDBPyConnection, file: Path, schema: str)
     connection.execute(text.replace("{schema}", schema))
 
 
-def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: pa.Table) -> None:
+def _create_table(
+    connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: pa.Table
+) -> None:
     connection.register("passed_in", table)
     connection.execute(f'CREATE TABLE "{schema}"."{name}" AS FROM passed_in')
     connection.unregister("passed_in")

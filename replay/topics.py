@@ -65,14 +65,16 @@ class Topics:
         if not self._files:
             raise refused[0]
         for one in refused:
-            self._say(f"{one.where}: {one.what}" if one.where else one.what)
+            self._report_once(f"{one.where}: {one.what}" if one.where else one.what)
         names = sorted({name for topics in self._files.values() for name in topics})
-        self._views = dict(zip(_distinct(names, taken=["topics", "columns"]), names, strict=True))
-        bare = [view.strip("/").replace("/", "_") for view in self._views]
-        folded = [name.casefold() for name in [*self._views, "topics", "columns", *bare]]
-        self._bare = {
+        self._views = dict(
+            zip(_make_unique(names, taken=["topics", "columns"]), names, strict=True)
+        )
+        short_names = [view.strip("/").replace("/", "_") for view in self._views]
+        folded = [name.casefold() for name in [*self._views, "topics", "columns", *short_names]]
+        self._short_names = {
             name: view
-            for name, view in zip(bare, self._views, strict=True)
+            for name, view in zip(short_names, self._views, strict=True)
             if name and folded.count(name.casefold()) == 1
         }
         self._made: set[str] = set()
@@ -88,7 +90,7 @@ class Topics:
                 self._make(view)
                 if view not in self._made and _quoted(view).lower() in lowered:
                     self._refuse(view)
-        for name, view in self._bare.items():
+        for name, view in self._short_names.items():
             if name.lower() in lowered:
                 self._make(view)
         for name, table in (("topics", self._list_topics), ("columns", self._list_columns)):
@@ -106,9 +108,9 @@ class Topics:
         for loss in recording.lost_messages:
             count = "" if loss.messages is None else f" ({counted(loss.messages, 'message')})"
             where = f"{recording.path}: " if self._several else ""
-            self._say(f"{where}{loss.topic or 'the file'}: {loss.reason}{count}")
+            self._report_once(f"{where}{loss.topic or 'the file'}: {loss.reason}{count}")
 
-    def _say(self, loss: str) -> None:
+    def _report_once(self, loss: str) -> None:
         if loss not in self._lost:
             self._lost.add(loss)
             self._report(visible(loss))
@@ -128,7 +130,7 @@ class Topics:
             return
         if self._several:
             self._create(view, " UNION ALL BY NAME ".join(parts))
-        for name in [name for name, of in self._bare.items() if of == view]:
+        for name in [name for name, of in self._short_names.items() if of == view]:
             self._create(name, f"FROM {_quoted(view)}")
         self._made.add(view)
 
@@ -206,18 +208,18 @@ class _Source:
                 finally:
                     self._topics.report(recording)
         except RecordingError as error:  # the file changed while it was read
-            self._topics._say(f"{self._topic}: {error.what}")
+            self._topics._report_once(f"{self._topic}: {error.what}")
 
     def _batch(self, log_ns: Any, fields: Mapping[str, FieldColumn]) -> pa.RecordBatch:
         columns = {"log_time_ns": pa.array(log_ns)}
         if STAMP in fields:
             columns["stamp_ns"] = pa.array(fields[STAMP])
-        arrays, names = _members(self._leaves, [fields[one.path] for one in self._leaves], 0)
-        names = [*columns, *_distinct(names, taken=[*columns, *self._taken])]
+        arrays, names = _message_arrays(self._leaves, [fields[one.path] for one in self._leaves], 0)
+        names = [*columns, *_make_unique(names, taken=[*columns, *self._taken])]
         return pa.RecordBatch.from_arrays([*columns.values(), *arrays], names)
 
 
-def _members(
+def _message_arrays(
     leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int
 ) -> tuple[list[pa.Array], list[str]]:
     """Return a message's fields as arrays, and their names, from the columns of its leaves."""
@@ -225,12 +227,12 @@ def _members(
     pairs = zip(leaves, columns, strict=True)
     for name, group in groupby(pairs, key=lambda pair: pair[0].steps[depth].name):
         some, values = zip(*group, strict=True)
-        arrays.append(_field(some, values, depth))
+        arrays.append(_field_array(some, values, depth))
         names.append(name)
     return arrays, names
 
 
-def _field(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -> pa.Array:
+def _field_array(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -> pa.Array:
     """Return one field as an array: of lists if it is repeated, of structs if it is a message."""
     if leaves[0].steps[depth].many:
         first = columns[0]
@@ -245,14 +247,14 @@ def _field(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -
             else column.reshape(rows * column.shape[1], *column.shape[2:])
             for column in columns
         ]
-        return pa.LargeListArray.from_arrays(pa.array(offsets), _items(leaves, items, depth))
-    return _items(leaves, columns, depth)
+        return pa.LargeListArray.from_arrays(pa.array(offsets), _item_arrays(leaves, items, depth))
+    return _item_arrays(leaves, columns, depth)
 
 
-def _items(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -> pa.Array:
+def _item_arrays(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -> pa.Array:
     if len(leaves[0].steps) > depth + 1:
-        arrays, names = _members(leaves, columns, depth + 1)
-        return pa.StructArray.from_arrays(arrays, _distinct(names))
+        arrays, names = _message_arrays(leaves, columns, depth + 1)
+        return pa.StructArray.from_arrays(arrays, _make_unique(names))
     (values,) = columns
     assert not isinstance(values, Ragged)
     if values.dtype == object:
@@ -260,7 +262,7 @@ def _items(leaves: Sequence[Leaf], columns: Sequence[FieldColumn], depth: int) -
     return pa.array(values.astype(values.dtype.newbyteorder("="), copy=False))
 
 
-def _distinct(names: Iterable[str], taken: Sequence[str] = ()) -> list[str]:
+def _make_unique(names: Iterable[str], taken: Sequence[str] = ()) -> list[str]:
     """Make names unique for DuckDB, which ignores case and does not allow empty names."""
     used, given = {name.casefold() for name in taken}, []
     for name in names:

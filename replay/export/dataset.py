@@ -100,7 +100,7 @@ def export_dataset(
         found = trajectories(
             selection.batches, continuous=continuous, counts=counts, where=selection.where
         )
-        episodes = _advancing(count_episodes(found, counts), advance)
+        episodes = _report_progress(count_episodes(found, counts), advance)
         if (first := next(episodes, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)
         if first.observations.shape[1] != selection.observation_size:
@@ -112,7 +112,7 @@ def export_dataset(
             )
         several: Iterator[Trajectory] = chain([first], episodes)
         if needs and to != WITH_IMAGES:
-            several = _while_there_is_room(several, out)
+            several = _check_disk_space(several, out)
         with building(out) as folder:
             partial = folder / out.name
             notes = write(selection, several, partial, counts)
@@ -126,7 +126,7 @@ def export_dataset(
     }
 
 
-def _advancing(
+def _report_progress(
     episodes: Iterator[Trajectory], advance: Callable[[int], None]
 ) -> Iterator[Trajectory]:
     for trajectory in episodes:
@@ -134,7 +134,7 @@ def _advancing(
         advance(len(trajectory))
 
 
-def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
+def _check_disk_space(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
     """Pass trajectories on, and raise StoreError before the disk is full."""
     for trajectory in episodes:
         free = shutil.disk_usage(out.parent).free

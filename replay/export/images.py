@@ -77,12 +77,12 @@ class ImageFeature:
         if layout.encoding in (JPEG, PNG) and layout.channels == 3 and layout.bits == 8:
             self.as_recorded += 1
             return frame.data, None
-        pixels = colours(frame.image())
+        pixels = to_rgb(frame.image())
         self.packed[f"{layout.encoding}, {layout.channels} channels"] += 1
         return png(pixels), pixels
 
 
-def colours(image: NDArray[Any]) -> NDArray[np.uint8]:
+def to_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Convert pixels to (H, W, 3): repeat grey three times, drop alpha."""
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
@@ -138,7 +138,7 @@ def pictures(
             file, seen = known[frame.frame_index]
             files[frame.transition_id] = file
             if frame.transition_id in sampled:
-                seen = colours(frame.image()) if seen is None else seen
+                seen = to_rgb(frame.image()) if seen is None else seen
                 step = max(max(seen.shape[:2]) // SMALL_PX, 1)
                 small.append(seen[::step, ::step])
         rows = [{"bytes": files[one], "path": None} for one in ids]

@@ -46,7 +46,7 @@ def write_lerobot(
         path.parent.mkdir(parents=True)
     writer: pq.ParquetWriter | None = None
     episodes: list[dict[str, Any]] = []
-    every: list[Stats] = []
+    all_stats: list[Stats] = []
     frames = 0
     features: dict[str, dict[str, Any]] = {}
     fps = 1 / selection.task.control_period_s
@@ -66,7 +66,7 @@ def write_lerobot(
         table = _table(columns, images)
         writer = writer or pq.ParquetWriter(data, table.schema)
         writer.write_table(table)
-        every.append(stats)
+        all_stats.append(stats)
         length = len(trajectory)
         episodes.append(
             {
@@ -83,7 +83,7 @@ def write_lerobot(
                 "restock/first_step": trajectory.first_step,
                 "restock/terminated": trajectory.terminated,
                 "restock/cut": trajectory.cut,
-                **{f"restock/{name}": said for name, said in trajectory.whose.items()},
+                **{f"restock/{name}": label for name, label in trajectory.robot_and_site.items()},
                 **{
                     f"stats/{name}/{kind}": value.tolist()
                     for name, kinds in stats.items()
@@ -96,7 +96,7 @@ def write_lerobot(
         writer.close()
     pq.write_table(pa.Table.from_pylist(episodes), about_episodes)
     _write_tasks(out / "meta/tasks.parquet")
-    _write_json(out / "meta/stats.json", _json(_together(every)))
+    _write_json(out / "meta/stats.json", _json(_merge_stats(all_stats)))
     _write_json(out / "meta/restock.json", selection.provenance | {"counts": counts.describe()})
     _write_json(
         out / "meta/info.json",
@@ -196,11 +196,14 @@ def _image_stats(images: NDArray[np.uint8]) -> dict[str, NDArray[np.float64]]:
     return shaped | {"count": np.array([len(images)])}
 
 
-def _together(every: list[Stats]) -> Stats:
+def _merge_stats(all_stats: list[Stats]) -> Stats:
     """Merge the episodes' statistics; quantiles are averaged, as in LeRobot."""
     whole: Stats = {}
-    for name in every[0]:
-        parts = {kind: np.stack([stats[name][kind] for stats in every]) for kind in every[0][name]}
+    for name in all_stats[0]:
+        parts = {
+            kind: np.stack([stats[name][kind] for stats in all_stats])
+            for kind in all_stats[0][name]
+        }
         weight = parts["count"] / parts["count"].sum()  # (episodes, 1)
         weight = weight.reshape(-1, *[1] * (parts["mean"].ndim - 1))
         mean = (parts["mean"] * weight).sum(axis=0)

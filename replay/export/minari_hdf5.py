@@ -43,7 +43,7 @@ def write_minari(
         out.absolute(),  # Minari joins a relative path to itself
         observation_space=observation_space,
         action_space=action_space,
-        env_spec=_twin(selection),
+        env_spec=_twin_spec(selection),
     )
     storage.update_metadata(
         {
@@ -60,14 +60,14 @@ def write_minari(
                 "episode_id": t.episode_id,
                 "first_step": t.first_step,
                 "cut": t.cut,
-                **t.whose,
+                **t.robot_and_site,
             },
             observations=t.observations,
             actions=t.actions,
             rewards=t.rewards,
             terminations=_only_last(t.terminated, len(t)),
             truncations=_only_last(t.truncated, len(t)),
-            infos={name: _padded(column) for name, column in t.carried.items()},
+            infos={name: _pad(column) for name, column in t.carried.items()},
         )
         for number, t in enumerate(trajectories)
     )
@@ -76,7 +76,7 @@ def write_minari(
     return []
 
 
-def _twin(selection: Selection) -> Any:
+def _twin_spec(selection: Selection) -> Any:
     """Return the twin's environment spec if it has the same task as these rows, else None."""
     if load_profile(TWIN_PROFILE).task.hash != selection.task.hash:
         return None
@@ -91,7 +91,7 @@ def _only_last(value: bool, length: int) -> NDArray[np.bool_]:
     return flags
 
 
-def _padded(column: NDArray[Any]) -> Any:
+def _pad(column: NDArray[Any]) -> Any:
     if column.dtype == object:
         return [*("" if value is None else str(value) for value in column), ""]
     empty = np.nan if column.dtype.kind == "f" else -1

@@ -104,7 +104,7 @@ def write_d3rlpy(
             group.attrs.update(
                 {"episode_id": t.episode_id, "first_step": t.first_step, "cut": t.cut}
             )
-            group.attrs.update(t.whose)
+            group.attrs.update(t.robot_and_site)
             if "transition_id" in t.carried:
                 group.create_dataset("transition_id", data=t.carried["transition_id"])
         file.create_dataset("num_episodes", data=number + 1)

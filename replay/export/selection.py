@@ -97,7 +97,7 @@ def open_selection(
     ):
         store.verify()
         chosen = chosen_cameras(store, cameras)
-        yield _of_query(store, connection, text, panel, continuous, chosen)
+        yield _select(store, connection, text, panel, continuous, chosen)
 
 
 _SIZES = ("tinyint", "smallint", "integer", "bigint", "hugeint")
@@ -113,7 +113,7 @@ _TYPES: dict[str, tuple[Collection[str], str]] = {
 }
 
 
-def _of_query(
+def _select(
     store: Store,
     connection: duckdb.DuckDBPyConnection,
     text: str,
@@ -139,11 +139,11 @@ def _of_query(
             if items.id not in types or listed != (name in _LISTS):
                 raise QueryError(f"its {name} is a {kind}, not {words}", where=where)
     requested, left_out = text, dict[str, int]()
-    state = _state(columns, result.types, where)
+    state = _state_sql(columns, result.types, where)
     if state:
         known = " AND ".join(f"coalesce(isfinite({value}), false)" for value in state.values())
         having = f"FROM ({text}) WHERE {known}"
-        left_out[f"{STATE} is not known"] = _fewer(connection, text, having, where)
+        left_out[f"{STATE} is not known"] = _count_lost(connection, text, having, where)
         text = having
     for camera in cameras:
         text, left_out[f"no frame of camera {camera}"] = _with_frames(
@@ -210,7 +210,7 @@ def _of_query(
             "panel": Panel.open(panel).id if panel is not None else None,
             "tags": _tags(store, facts[2] or []),
             **({"cameras": list(cameras)} if cameras else {}),
-            **_of_task(task, continuous),
+            **_describe_task(task, continuous),
             **({"observation_names": list(state)} if state else {}),
         },
         by_name=bool(state),
@@ -238,11 +238,11 @@ def _with_frames(
         f"FROM ({text}) WHERE transition_id IN"
         f" (SELECT transition_id FROM transition_frames WHERE camera = {literal(camera)})"
     )
-    fewer = _fewer(connection, text, having, where, f"a frame of camera {camera!r}")
+    fewer = _count_lost(connection, text, having, where, f"a frame of camera {camera!r}")
     return having, fewer
 
 
-def _fewer(
+def _count_lost(
     connection: duckdb.DuckDBPyConnection, text: str, having: str, where: str, what: str = STATE
 ) -> int:
     """Return how many rows of `text` are not in `having`; raise StoreError if that is all."""
@@ -261,7 +261,7 @@ def _fewer(
     return int(counts[0] - counts[1])
 
 
-def _state(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str, str]:
+def _state_sql(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str, str]:
     """Return name -> SQL of each number in a query's `observation.state`; {} if it has none.
 
     Raises:
@@ -306,7 +306,7 @@ def _batches(
         raise QueryError(str(error).splitlines()[0], where=where) from error
 
 
-def _of_task(task: Task, continuous: bool) -> dict[str, Any]:
+def _describe_task(task: Task, continuous: bool) -> dict[str, Any]:
     return {
         "task_hash": task.hash,
         "task": msgspec.to_builtins(task),

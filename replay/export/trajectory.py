@@ -54,10 +54,10 @@ class Trajectory:
         return not self.terminated
 
     @property
-    def whose(self) -> dict[str, str]:
+    def robot_and_site(self) -> dict[str, str]:
         """Return its robot and site, if the rows have them; they are the same in all steps."""
-        said = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
-        return {name: "" if value is None else str(value) for name, value in said.items()}
+        first = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
+        return {name: "" if value is None else str(value) for name, value in first.items()}
 
 
 @dataclass
@@ -118,8 +118,8 @@ class _Rows:
 
     def __init__(self, table: pa.Table, continuous: bool, where: str) -> None:
         self.where = where
-        self.episode: NDArray[Any] = _whole(table, "episode_id", where)
-        self.step: Ints = np.asarray(_whole(table, "step_index", where), np.int64)
+        self.episode: NDArray[Any] = _required_column(table, "episode_id", where)
+        self.step: Ints = np.asarray(_required_column(table, "step_index", where), np.int64)
         self.observation = observation_matrix(table["observation"], where)
         self.next_observation = observation_matrix(table["next_observation"], where)
         if self.observation.shape != self.next_observation.shape:
@@ -129,9 +129,9 @@ class _Rows:
                 where=where,
                 remedy="export the observations as they are stored",
             )
-        self.terminated: Bools = np.asarray(_whole(table, "terminated", where), np.bool_)
-        self.truncated: Bools = np.asarray(_whole(table, "truncated", where), np.bool_)
-        self.reward: F32 = np.asarray(_whole(table, "reward", where), np.float32)
+        self.terminated: Bools = np.asarray(_required_column(table, "terminated", where), np.bool_)
+        self.truncated: Bools = np.asarray(_required_column(table, "truncated", where), np.bool_)
+        self.reward: F32 = np.asarray(_required_column(table, "reward", where), np.float32)
         if count := int(np.isnan(self.reward).sum()):
             raise StoreError(
                 f"{count} rows have a reward that is not a number",
@@ -140,12 +140,15 @@ class _Rows:
             )
         self.action: NDArray[Any] = (
             np.stack(
-                [np.asarray(_whole(table, name, where), np.float32) for name in COMMAND], axis=1
+                [np.asarray(_required_column(table, name, where), np.float32) for name in COMMAND],
+                axis=1,
             )
             if continuous
-            else np.asarray(_whole(table, "action", where), np.int64)
+            else np.asarray(_required_column(table, "action", where), np.int64)
         )
-        self.carried = {name: _plain(table, name) for name in CARRIED if name in table.column_names}
+        self.carried = {
+            name: _column(table, name) for name in CARRIED if name in table.column_names
+        }
         if STATE in table.column_names:
             self.carried[STATE] = observation_matrix(table[STATE], where)
 
@@ -217,16 +220,16 @@ def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
     return flat.reshape(len(array), size)
 
 
-def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
+def _required_column(table: pa.Table, name: str, where: str) -> NDArray[Any]:
     """Return a column as an array; raise StoreError if it has nulls."""
     if count := table[name].null_count:
         raise StoreError(
             f"{count} rows have no {name}", where=where, remedy=f"add WHERE {name} IS NOT NULL"
         )
-    return _plain(table, name)
+    return _column(table, name)
 
 
-def _plain(table: pa.Table, name: str) -> NDArray[Any]:
+def _column(table: pa.Table, name: str) -> NDArray[Any]:
     """Return a scalar column; integers with nulls become float64, text becomes objects."""
     values: NDArray[Any] = table[name].to_numpy()
     return values

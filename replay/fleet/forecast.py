@@ -62,14 +62,17 @@ def forecast(
     amount = np.append(amount, amount.mean())
     rates, draws = np.zeros(replicates), np.zeros(replicates)
     found = np.append(found, 0.0)
-    for index, weights in enumerate(_replicates(episodes, rng, replicates)):
+    for index, weights in enumerate(_bootstrap_weights(episodes, rng, replicates)):
         each = float(weights @ found) / max(float(weights @ amount), 1e-300)
-        rates[index], draws[index] = each, _needed(found, amount, weights, each, missing, rng)
+        rates[index], draws[index] = (
+            each,
+            _simulate_amount(found, amount, weights, each, missing, rng),
+        )
     low, high = np.quantile(rates, [0.025, 0.975])
     return Forecast(episodes, seen, rate, float(low), float(high), draws)
 
 
-def _needed(
+def _simulate_amount(
     found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
 ) -> float:
     """Simulate missions in one replicate; return the amount until `missing` is reached."""
@@ -82,7 +85,7 @@ def _needed(
         return max(missing + spread * math.sqrt(episodes) * float(rng.normal()), 0.0) / rate
     total = spent = 0.0
     while True:
-        drawn = _drawn(weights, math.ceil(episodes * 1.5) + 8, rng)
+        drawn = _draw_episodes(weights, math.ceil(episodes * 1.5) + 8, rng)
         reached = total + np.cumsum(found[drawn])
         if reached[-1] >= missing:
             last = int(np.searchsorted(reached, missing))
@@ -116,18 +119,18 @@ def probability_to_close(
         if not len(found) or not missions or not found.any():
             continue
         found = np.append(found, 0.0)
-        for index, weights in enumerate(_replicates(len(found) - 1, rng, REPLICATES)):
+        for index, weights in enumerate(_bootstrap_weights(len(found) - 1, rng, REPLICATES)):
             if missions > _SIMULATED:
                 mean = float(weights @ found)
                 spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))
                 chance = spread * math.sqrt(missions) * float(rng.normal())
                 total[index] += missions * mean + chance
             else:
-                total[index] += found[_drawn(weights, missions, rng)].sum()
+                total[index] += found[_draw_episodes(weights, missions, rng)].sum()
     return float((total >= missing).mean())
 
 
-def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
+def _bootstrap_weights(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
     """Yield the weights (E + 1,) of E episodes and an additional one, for each replicate.
 
     The additional episode has half the weight and yield 0: even if every one of a few episodes had
@@ -137,7 +140,7 @@ def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator
     return (rng.dirichlet(prior) for _ in range(count))
 
 
-def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
+def _draw_episodes(weights: F64, size: int, rng: np.random.Generator) -> Ints:
     """Draw `size` episodes with replacement, in proportion to weights (E,)."""
     steps = np.cumsum(weights)
     drawn = np.searchsorted(steps, rng.random(size) * steps[-1], side="right")

@@ -72,7 +72,7 @@ class Yields:
         """Return each episode's rows in a cell, (E,); a field missing from the cell may be any."""
         kept = np.ones(len(self.cells), np.bool_)
         for name, value in cell.items():
-            kept &= self._is(name, value)
+            kept &= self._matches(name, value)
         return self._sum(kept)
 
     def values(self, name: str) -> list[str | int]:
@@ -91,7 +91,7 @@ class Yields:
         share = self.rows_of({"zone": zone}) / np.maximum(self.total, 1)
         return np.asarray(self.hours * share, np.float64)
 
-    def _is(self, name: str, value: str | int) -> Bools:
+    def _matches(self, name: str, value: str | int) -> Bools:
         if name == "condition":
             held = [one for one in self.cells[name].unique().to_pylist() if value in one.split(",")]
             return np.asarray(pc.is_in(self.cells[name], pa.array(held, pa.string())), np.bool_)
@@ -125,7 +125,7 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
     )
 
 
-def in_order(yields: Yields, names: pa.Array, found: F64) -> F64:
+def reorder(yields: Yields, names: pa.Array, found: F64) -> F64:
     """Reorder values `found` of the episodes `names` to the order of `yields`, (E,); NaN if none.
 
     `found` has one value per name.
@@ -192,11 +192,11 @@ def find_gaps(
     with open_source(store, requested, folder=None if folder is None else Path(folder)) as source:
         plan = plan_panel(source.connection, requested, source.conditions, source.others)
     yields = read_yields(store.connection, kinds)
-    gaps = _of_strata(plan, yields, f"mixture {name}")
+    gaps = _find_strata_gaps(plan, yields, f"mixture {name}")
     if thresholds is not None:
-        gaps += _of_audits(store.connection, yields, thresholds)
+        gaps += _find_audit_gaps(store.connection, yields, thresholds)
     if min_rows:
-        gaps += _of_cells(yields, store.conditions(), min_rows)
+        gaps += _find_cell_gaps(yields, store.conditions(), min_rows)
     gaps.sort(key=lambda gap: (gap.counted, -gap.missing, str(gap.cell)))
     named = dict(
         store.sql(
@@ -245,22 +245,22 @@ def _without_split(store: Store, mixture: Mixture) -> Mixture:
     return mixture if several else msgspec.structs.replace(mixture, evaluation_split=none)
 
 
-def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
+def _find_strata_gaps(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
     """Return a gap for each stratum with too few rows for its wanted share."""
     gaps = []
     names = plan.rows["episode_id"].combine_chunks().dictionary
     for code, line in enumerate(plan.strata):
         if not line.missing_rows or line.source != LOGS:
             continue
-        found = in_order(yields, names, plan.found[line.name])
+        found = reorder(yields, names, plan.found[line.name])
         needed = line.rows + line.missing_rows
         cell: dict[str, str | int] = {"stratum": line.name}
-        thin = _thinnest(plan, code, needed)
+        thin = _rank_zones(plan, code, needed)
         gaps.append(Gap(asked_by, cell, "rows", needed, line.rows, found, thinnest=thin))
     return gaps
 
 
-def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
+def _rank_zones(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
     """Return up to three zones whose rows in a stratum are furthest below their share of driving.
 
     A zone's part of `needed` is its share of all rows.
@@ -274,7 +274,7 @@ def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
     return tuple(names[place] for place in np.argsort(-short)[:3].tolist() if short[place] > 0)
 
 
-def _of_audits(
+def _find_audit_gaps(
     connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
 ) -> list[Gap]:
     """Return the gaps by the thresholds of AUDITS, including closed ones."""
@@ -308,7 +308,7 @@ def _of_audits(
     return gaps
 
 
-def _of_cells(yields: Yields, conditions: Sequence[Condition], min_rows: int) -> list[Gap]:
+def _find_cell_gaps(yields: Yields, conditions: Sequence[Condition], min_rows: int) -> list[Gap]:
     """Return a gap for each cell with fewer than `min_rows` rows, including empty ones.
 
     A robot's cell counts only that robot's rows, but is forecast from the rows of all robots.

@@ -68,7 +68,7 @@ def read_missions(path: str | Path) -> MissionsFile:
     return typed(document, MissionsFile, where=str(path), remedy=_REMEDY, renamed=MISSIONS_KEYS)
 
 
-def of_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
+def from_shopping_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:
     """Convert a shopping list to a missions file; `store` is STORE@VERSION.
 
     Raises:

@@ -127,13 +127,14 @@ def shopping_list(
                 draws = np.random.default_rng(0)
                 table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
     filled = [
-        _filled(gap, {s: table[index, s] for s in _supplies(gap, kinds)})
+        _fill_gap(gap, {s: table[index, s] for s in _supplies(gap, kinds)})
         for index, gap in enumerate(gaps)
     ]
     reachable = [index for index, one in enumerate(filled) if one.best is not None]
-    amounts = _least(gaps, reachable, table, CONFIDENCE, unit)
+    amounts = _minimise_amounts(gaps, reachable, table, CONFIDENCE, unit)
     total_low, total_high = (
-        sum(_least(gaps, reachable, table, share, unit).values()) for share in (0.025, 0.975)
+        sum(_minimise_amounts(gaps, reachable, table, share, unit).values())
+        for share in (0.025, 0.975)
     )
     orders = [
         _order(supply, amount, gaps, table, yields, unit) for supply, amount in amounts.items()
@@ -159,22 +160,22 @@ def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
     ]
 
 
-def _filled(gap: Gap, mine: dict[Supply, Forecast]) -> FilledGap:
-    known = {supply: one for supply, one in mine.items() if one.known}
+def _fill_gap(gap: Gap, forecasts: dict[Supply, Forecast]) -> FilledGap:
+    known = {supply: one for supply, one in forecasts.items() if one.known}
     if known:
         best = min(known, key=lambda supply: known[supply].quantile(CONFIDENCE))
         return FilledGap(gap, best, known[best], None)
     # Choose the kind named like the gap, else the kind with the fewest episodes so far.
     named = [
         supply
-        for supply in mine
+        for supply in forecasts
         if supply.kind in (gap.cell.get("condition"), gap.cell.get("stratum"))
     ]
-    likely = min(named or mine, key=lambda supply: (mine[supply].episodes, supply.name))
-    return FilledGap(gap, None, None, (likely, missions_to_see_one(mine[likely].episodes)))
+    likely = min(named or forecasts, key=lambda supply: (forecasts[supply].episodes, supply.name))
+    return FilledGap(gap, None, None, (likely, missions_to_see_one(forecasts[likely].episodes)))
 
 
-def _least(
+def _minimise_amounts(
     gaps: Sequence[Gap],
     reachable: Sequence[int],
     table: dict[tuple[int, Supply], Forecast],
@@ -398,10 +399,10 @@ def install_gaps(store: Store) -> None:
     can drive.)
     """
     script = files("restock.replay.fleet") / "gaps.sql"
-    install_planned(store, ("gaps",), {"planned_gaps": (COLUMNS, _gaps_table)}, script, _list_of)
+    install_planned(store, ("gaps",), {"planned_gaps": (COLUMNS, _gaps_table)}, script, _plan_list)
 
 
-def _list_of(own: Store, name: str) -> ShoppingList:
+def _plan_list(own: Store, name: str) -> ShoppingList:
     yields, gaps = find_gaps(
         own,
         load_mixture(name),

@@ -215,10 +215,10 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str
         if kinds[name] != fit[name] and not kinds[name].endswith("null"):
             what = f"{name} must be {fit[name]}, not {kinds[name]}"
             raise StoreError(what, where=where, remedy=remedy)
-    return {} if needed == _NEEDED else _fill(connection, given, where, remedy)
+    return {} if needed == _NEEDED else _convert_any_task(connection, given, where, remedy)
 
 
-def _fill(
+def _convert_any_task(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, where: str, remedy: str
 ) -> dict[str, int]:
     """Replace `given` by rows in the form of a store; return reason -> number of rows left out."""
@@ -235,8 +235,8 @@ def _fill(
         for row, width, size in connection.sql(
             f"SELECT place, len(observation), size {first}"
         ).fetchall():
-            said = what.format(row=row, width=width, size=size)
-            raise StoreError(said, where=where, remedy=remedy)
+            message = what.format(row=row, width=width, size=size)
+            raise StoreError(message, where=where, remedy=remedy)
     unknown = "next_observation IS NULL"
     ((lost,),) = connection.sql(f"SELECT count(*) FROM filled WHERE {unknown}").fetchall()
     connection.unregister("given")
@@ -345,7 +345,7 @@ def write_panel(
     """
     out = Path(out)
     check_free(out, force)
-    with building(out) as partial, _enough_memory():
+    with building(out) as partial, _report_out_of_memory():
         scratch = partial / "scratch"
         scratch.mkdir()
         task_json = source.task_json(plan.task_hash)
@@ -361,8 +361,8 @@ def write_panel(
         header = _header(source, plan, identity, task_json, size, files)
         (partial / HEADER).write_bytes(seal(header))
         for name in (HEADER, *header.files):
-            _finish(partial / name)
-        _put(partial, out, force)
+            _finish_file(partial / name)
+        _move_into_place(partial, out, force)
     return Panel.open(out)
 
 
@@ -382,7 +382,7 @@ def _write_all(
 
 
 @contextmanager
-def _enough_memory() -> Iterator[None]:
+def _report_out_of_memory() -> Iterator[None]:
     """Raise PanelError if DuckDB runs out of memory while the block runs."""
     try:
         yield
@@ -421,14 +421,14 @@ def check_free(out: Path, force: bool) -> None:
         )
 
 
-def _finish(path: Path) -> None:
+def _finish_file(path: Path) -> None:
     """Flush a file to disk, and make it read-only: a panel never changes."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
     path.chmod(0o444)
 
 
-def _put(partial: Path, out: Path, force: bool) -> None:
+def _move_into_place(partial: Path, out: Path, force: bool) -> None:
     """Rename the finished panel to `out`, after moving an old panel away if it is replaced."""
     partial.chmod(0o755)  # mkdtemp lets only the owner in
     old = partial.with_name(partial.name + "-old")

@@ -95,13 +95,13 @@ class LoggedSampler(Stateful):
         `stock` (S,): see `ShareController.at`.
         """
         if changed := self.controller.at(env_steps, stock):
-            self._follow()
+            self._apply_shares()
         return changed
 
     def replan(self, planned: PlannedDraws) -> None:
         """Plan for another number of draws from the next batch on."""
         if self.controller.replan(planned):
-            self._follow()
+            self._apply_shares()
 
     def draw(self, count: int | None = None) -> BatchDraw:
         """Draw `count` rows for a batch, or fewer if too few rows may still be drawn."""
@@ -110,13 +110,15 @@ class LoggedSampler(Stateful):
         rows, strata = self.sampler.draw()
         of_rule = self.sampler.drawn_weights
         if self.replays is not None and self.controller.max_replays is not None:
-            rows, strata, of_rule = self._hold(rows, strata, of_rule, self.controller.max_replays)
+            rows, strata, of_rule = self._enforce_limit(
+                rows, strata, of_rule, self.controller.max_replays
+            )
         self.controller.count(strata)
         weight = of_rule
         if (corrected := self.weights_of(rows)) is not None:
             weight = corrected if of_rule is None else corrected * of_rule
-        if self.replays is not None and self._used_up() and self.controller.give_up():
-            self._follow()
+        if self.replays is not None and self._is_used_up() and self.controller.give_up():
+            self._apply_shares()
         return BatchDraw(rows, strata, weight, quota)
 
     def weights_of(self, rows: Ints) -> F32 | None:
@@ -141,15 +143,15 @@ class LoggedSampler(Stateful):
         """Take |TD error| (n,) of rows (n,) that were just used in an update."""
         self.sampler.update(rows, td_abs)
 
-    def _follow(self) -> None:
+    def _apply_shares(self) -> None:
         """Apply the controller's shares to the sampler and the weights."""
         self.sampler.set_shares(self.controller.shares)
         if isinstance(self._weights, WeightsInForce):
             self._weights.set_shares(self.controller.shares)
 
-    restored = _follow
+    restored = _apply_shares
 
-    def _hold(
+    def _enforce_limit(
         self, rows: Ints, strata: Ints, weight: F32 | None, limit: int
     ) -> tuple[Ints, Ints, F32 | None]:
         """Count the drawn rows (L,), and replace those beyond the limit."""
@@ -200,7 +202,7 @@ class LoggedSampler(Stateful):
                 return int(free[self._rng.integers(len(free))]), code
         return None
 
-    def _used_up(self) -> bool:
+    def _is_used_up(self) -> bool:
         """Return whether a stratum with a share has used up all its draws."""
         controller, full = self.controller, self.controller.drawn >= self._budget
         return bool(controller.shares[full].any()) and controller.logs_share > 0

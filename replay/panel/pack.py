@@ -107,8 +107,8 @@ class PackedFile:
                 for value in values
             )
         block = rows // BLOCK_ROWS
-        into = _Stretches(rows)
-        out_of = [None if value.of is None else _Stretches(value.of) for value in values]
+        into = _RowRanges(rows)
+        out_of = [None if value.of is None else _RowRanges(value.of) for value in values]
         for begin, end in itertools.pairwise([0, *np.flatnonzero(np.diff(block)) + 1, len(rows)]):
             if begin == end:
                 continue
@@ -168,7 +168,7 @@ def _read_into(out: F32, file: int, at: int) -> bool:
     return True
 
 
-class _Stretches:
+class _RowRanges:
     """Ranges of row numbers (m,), as slices if the numbers are consecutive: slices copy faster."""
 
     def __init__(self, rows: Ints) -> None:
@@ -203,7 +203,7 @@ _SPLIT_COLUMNS = (
 )
 
 
-def going_on(rows: pa.Table, random_probability: float) -> Bools:
+def continues_return(rows: pa.Table, random_probability: float) -> Bools:
     """Return whether a row's n-step return may go on to the next row, (N,).
 
     It may if that row is the next step of the same episode, and the same policy chose its action
@@ -228,7 +228,7 @@ def going_on(rows: pa.Table, random_probability: float) -> Bools:
 def n_step_horizon(continues: Bools, n_step: int) -> Ints:
     """Return how many steps each row's return spans, (N,) in 1..n_step.
 
-    `continues` (N,) comes from `going_on`.
+    `continues` (N,) comes from `continues_return`.
     """
     horizon = np.ones(len(continues), np.int64)
     unbroken = np.ones(len(continues), np.bool_)
@@ -242,7 +242,7 @@ def n_step_horizon(continues: Bools, n_step: int) -> Ints:
 
 
 class Packer:
-    """Packs the rows of one plan; `random_probability` as in `going_on`."""
+    """Packs the rows of one plan; `random_probability` as in `continues_return`."""
 
     def __init__(
         self,
@@ -264,7 +264,9 @@ class Packer:
         for begin, end, rows in self._stretches():
             # Includes the following rows that a return can reach.
             part = plan.rows.slice(begin, end - begin + self.mixture.n_step)
-            horizon = n_step_horizon(going_on(part, random_probability), self.mixture.n_step)[rows]
+            horizon = n_step_horizon(
+                continues_return(part, random_probability), self.mixture.n_step
+            )[rows]
             self.chosen[at : at + len(rows)] = begin + rows
             self.last[at : at + len(rows)] = begin + rows + horizon - 1
             at += len(rows)
@@ -321,7 +323,7 @@ class Packer:
     def _write(self, rows: PackedFile, size: int, batch: pa.RecordBatch, place: Ints) -> None:
         """Write a batch's values to the packed rows that use them."""
         part = row_columns(size)
-        target, behind = _between(self.chosen, place)
+        target, behind = _find_ranges(self.chosen, place)
         packed = np.flatnonzero(behind > target)  # rows of the batch that are packed
         target = target[packed]
         observation = matrix(batch.column("observation"), size)
@@ -339,7 +341,7 @@ class Packer:
             Values(part["reward"], returns[:, None], packed),
         )
         # Packed rows whose return ends with a row of this batch take its next observation.
-        first, behind = _between(self.last, place)
+        first, behind = _find_ranges(self.last, place)
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
         not_terminated = ~np.asarray(
@@ -353,8 +355,8 @@ class Packer:
             Values(part["discount"], discount),
         )
         if not (
-            _finite(observation, packed)
-            and _finite(next_observation, source)
+            _is_finite(observation, packed)
+            and _is_finite(next_observation, source)
             and np.isfinite(returns).all()
         ):
             raise PanelError(
@@ -401,23 +403,23 @@ def _groups(rows: int, stop: Event) -> Iterator[slice]:
 @contextmanager
 def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
     """Yield a function that appends a row group to a Parquet file."""
-    made: list[pq.ParquetWriter] = []
+    writers: list[pq.ParquetWriter] = []
 
     def write(rows: pa.Table) -> None:
         for place, field in enumerate(rows.schema):
             if pa.types.is_dictionary(field.type):
                 column = _compact(rows.column(place).combine_chunks())
                 rows = rows.set_column(place, field.name, column)
-        if not made:
+        if not writers:
             coded = [name for name in rows.schema.names if name not in _NO_DICTIONARY]
             writer = pq.ParquetWriter(path, rows.schema, compression="zstd", use_dictionary=coded)
-            made.append(writer)
-        made[0].write_table(rows)
+            writers.append(writer)
+        writers[0].write_table(rows)
 
     try:
         yield write
     finally:
-        for writer in made:
+        for writer in writers:
             writer.close()
 
 
@@ -429,12 +431,12 @@ def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(codes, column.dictionary.take(order))
 
 
-def _finite(values: NDArray[np.float32], rows: Ints) -> bool:
+def _is_finite(values: NDArray[np.float32], rows: Ints) -> bool:
     """Return whether values (m, c) are finite in these rows (n,)."""
     return bool(np.isfinite(values).all() or np.isfinite(values[rows]).all())
 
 
-def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
+def _find_ranges(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
     """Return begin and end of each value's range in an ascending array, (n,) each."""
     # Values of one batch are mostly close together, so only a small part is searched.
     low, high = np.searchsorted(ascending, [values.min(), values.max() + 1])

@@ -66,7 +66,7 @@ def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
     return events
 
 
-def opened_by(event: DoubtfulEvent, store: str) -> str:
+def trace_command(event: DoubtfulEvent, store: str) -> str:
     """Return the command that shows an event's first step.
 
     It also shows the messages of that step if the recording still exists.
@@ -88,7 +88,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
             row[name] = None if row[name] is None else round(row[name], digits)
         for name in ("start_time", "end_time"):
             row[name] = row[name].isoformat(sep=" ", timespec="milliseconds")
-        rows.append({**row, "open": opened_by(event, store), "verdict": ""})
+        rows.append({**row, "open": trace_command(event, store), "verdict": ""})
     return rows
 
 

@@ -27,7 +27,7 @@ from restock.ingest.store.manifest import Correction
 from restock.replay.store.store import Store
 
 _MOVED_S = 0.1  # largest difference of a step's time from the time in the file
-_MAX_SAID = 10  # largest number of a file's problems in the error message
+_MAX_PROBLEMS = 10  # largest number of a file's problems in the error message
 _ROWS = """
 SELECT
     recording_id, ingest_id, episode_id, episode_index, step_index, logged_ns,
@@ -60,7 +60,7 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Annotated[str, Meta(pattern=r"^(yes|no|[0-9]{1,9}\.\.[0-9]{1,9}|)$")] = ""
     start_s: float | None = None  # time of its first step when it was shown
 
-    def says(self) -> list[tuple[int, int, bool]]:
+    def ranges(self) -> list[tuple[int, int, bool]]:
         """Return ranges of steps: first, last, and whether the condition holds there."""
         own = (self.first_step, self.last_step)
         first, dots, last = self.verdict.partition("..")
@@ -110,21 +110,21 @@ def read_verdicts(path: Path | str, store: Store) -> Verdicts:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise LabelError(f"cannot be read: {first_line(error)}", where=str(path)) from error
-    for number, said in _rows(text, path):
-        if "verdict" not in said:
+    for number, cells in _rows(text, path):
+        if "verdict" not in cells:
             left_open += 1
             continue
-        said["verdict"] = said["verdict"].lower()
+        cells["verdict"] = cells["verdict"].lower()
         try:
-            lines.append((number, msgspec.convert(said, Line, strict=False)))
+            lines.append((number, msgspec.convert(cells, Line, strict=False)))
         except msgspec.ValidationError as error:
             problems[number] = str(error)
             if problems[number].endswith("`$.verdict`"):
-                problems[number] = f"the verdict {said['verdict']!r} is not yes, no or FIRST..LAST"
+                problems[number] = f"the verdict {cells['verdict']!r} is not yes, no or FIRST..LAST"
     found = check(lines, store)
     problems |= found.problems
     if problems:
-        shown = [f"line {line}: {what}" for line, what in sorted(problems.items())[:_MAX_SAID]]
+        shown = [f"line {line}: {what}" for line, what in sorted(problems.items())[:_MAX_PROBLEMS]]
         if more := len(problems) - len(shown):
             shown.append(f"and {more} more")
         raise LabelError(
@@ -173,7 +173,7 @@ def check(lines: Iterable[tuple[int, Line]], store: Store) -> Verdicts:
             problems[number] = problem
             continue
         entry = given.setdefault(episode.recording_id, RecordingCorrections(episode.ingest_id, []))
-        for first, last, value in line.says():
+        for first, last, value in line.ranges():
             rows = episode.rows(first, last)
             entry.corrections.append(
                 Correction(
@@ -193,7 +193,7 @@ def _problem(line: Line, episode: _Episode, conditions: list[str]) -> str:
     if line.condition not in conditions:
         has = ", ".join(conditions)
         return f"no condition {line.condition!r} labelled that recording: it has {has}"
-    stretches = [(line.first_step, line.last_step), *(said[:2] for said in line.says())]
+    stretches = [(line.first_step, line.last_step), *(cells[:2] for cells in line.ranges())]
     if any(first > last for first, last in stretches):
         return f"steps {line.first_step} to {line.last_step}, {line.verdict}: end before they begin"
     first, last = min(low for low, _ in stretches), max(high for _, high in stretches)

@@ -87,7 +87,11 @@ def messages_at_tick(
             where=str(path),
             remedy="ingest the recording again: its profile has changed",
         )
-    messages = [*_of_inputs(aligned), *_of_transforms(aligned, stamp_ns), *_of_signals(aligned)]
+    messages = [
+        *_input_messages(aligned),
+        *_transform_messages(aligned, stamp_ns),
+        *_signal_messages(aligned),
+    ]
     named = [
         MessageAtTick(
             input=name,
@@ -109,7 +113,7 @@ def messages_at_tick(
 _Message = tuple[str, str, float | None, TopicColumns, int, int, dict[str, Any]]
 
 
-def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
+def _input_messages(aligned: AlignedInputs) -> Iterator[_Message]:
     for name, source in aligned.inputs.by_name.items():
         latest, columns = aligned.latest(name), aligned.inputs.topics[source.topic]
         if latest.fresh[0]:
@@ -118,7 +122,7 @@ def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
             yield name, source.topic, source.max_age_s, columns, row, int(latest.age_ns[0]), fields
 
 
-def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
+def _signal_messages(aligned: AlignedInputs) -> Iterator[_Message]:
     """Yield the message of each custom signal, with the signal's value under its path."""
     for name, signal in aligned.profile.signals.items():
         columns = aligned.inputs.topics.get(signal.topic)
@@ -132,7 +136,7 @@ def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
             yield f"signals.{name}", signal.topic, signal.max_age_s, columns, row, age_ns, value
 
 
-def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
+def _transform_messages(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
     """Yield the transforms from the robot's frame to the fixed frame, if they give the pose."""
     tree = aligned.tree
     if tree is None or "pose" in aligned.inputs.by_name:

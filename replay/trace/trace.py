@@ -54,9 +54,11 @@ def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None
     path, row = Path(place), str(row)
     trace = Trace()
     if (path / RUN_CONFIG).is_file():
-        _of_run(trace, path, row, recording)
+        _trace_run_row(trace, path, row, recording)
     elif (path / HEADER).is_file():
-        _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), recording)
+        _trace_panel_row(
+            trace, Panel.open(path), _number(row, path, "row number of the panel"), recording
+        )
     elif is_store(location := Location.of(place)):
         number = _number(row, path, "transition id")
         version = None
@@ -92,11 +94,11 @@ def listed_rows(place: str | Path, limit: int = 20) -> list[dict[str, Any]]:
         return rows_of(connection, sql_file("trace_rows.sql"), {"limit": limit})
 
 
-def _of_run(trace: Trace, run: Path, row: str, recording: Path | str | None) -> None:
+def _trace_run_row(trace: Trace, run: Path, row: str, recording: Path | str | None) -> None:
     document = read_json(run / RUN_CONFIG, error=RunError)
     trace.audit = audit = _audit_row(run, row)
     if audit["source"] == "fresh":
-        _of_twin(trace, run, document, audit)
+        _add_twin_episode(trace, run, document, audit)
         return
     run_panel = document.get("panel") or {}
     panel_path = Path(run_panel.get("path", ""))
@@ -113,10 +115,10 @@ def _of_run(trace: Trace, run: Path, row: str, recording: Path | str | None) -> 
             where=str(panel_path),
             remedy="trace the row of that panel: `restock trace PANEL ROW`",
         )
-    _of_panel(trace, panel, int(audit["panel_row"]), recording)
+    _trace_panel_row(trace, panel, int(audit["panel_row"]), recording)
 
 
-def _of_panel(trace: Trace, panel: Panel, number: int, recording: Path | str | None) -> None:
+def _trace_panel_row(trace: Trace, panel: Panel, number: int, recording: Path | str | None) -> None:
     if not 0 <= number < len(panel):
         raise PanelError(f"has rows 0 to {len(panel) - 1}, not {number}", where=str(panel.path))
     meta = panel.meta.slice(number, 1).to_pylist()[0]
@@ -145,7 +147,7 @@ def _origin(sources: list[StoreVersion], transition: int, recording: Path | str 
     return find_origin(sources, transition, recording=recording)
 
 
-def _of_twin(
+def _add_twin_episode(
     trace: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
     """Add a fresh row's episode in the twin, and the spec to generate it again."""

@@ -165,7 +165,11 @@ class GapsCommand:
     def run(self) -> None:
         """Find the gaps, plan what fills them, and print both."""
         from restock.files import expect_file_place
-        from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
+        from restock.replay.fleet.missions_file import (
+            from_shopping_list,
+            refuse_existing,
+            write_missions,
+        )
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.replay.store.store import Store
@@ -185,7 +189,7 @@ class GapsCommand:
             )
             place = f"{store.path}@{store.version}"
         if self.missions_out is not None:
-            plan = of_list(found, store=place, mixture=self.mixture)
+            plan = from_shopping_list(found, store=place, mixture=self.mixture)
             write_missions(self.missions_out, plan)
             answer["missions_file"] = str(self.missions_out)
         if self.json:
