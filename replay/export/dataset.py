@@ -102,7 +102,7 @@ def export_dataset(
         )
         episodes = _report_progress(count_episodes(found, counts), advance)
         if (first := next(episodes, None)) is None:
-            raise StoreError("no whole transition is left of the rows", where=selection.where)
+            raise StoreError("the rows contain no whole transition", where=selection.where)
         if first.observations.shape[1] != selection.observation_size:
             raise StoreError(
                 f"observations have {first.observations.shape[1]} entries, those of its task"

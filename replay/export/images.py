@@ -64,12 +64,12 @@ class ImageFeature:
                 f"camera {self.camera!r} has frames of {size[1]} x {size[0]} and of"
                 f" {self.shape[1]} x {self.shape[0]} pixels",
                 where=where,
-                remedy="a data set has one size: export the recordings apart, with --query",
+                remedy="a data set has one image size: export these recordings apart, with --query",
             )
         if layout.bits > 8:
             raise StoreError(
                 f"camera {self.camera!r} has {layout.bits} bits a channel ({layout.encoding}),"
-                " LeRobot's pictures have 8",
+                " but LeRobot's pictures have 8",
                 where=where,
                 remedy="name the other cameras with --cameras, or none",
             )

@@ -83,7 +83,7 @@ def open_selection(
         header = Panel.open(path).header
         if query is not None or panel is not None or header.others or header.store_version < 0:
             raise PanelError(
-                "only a panel of one store is exported by itself, and without a query",
+                "without a store, only a panel of one store can be exported, and without a query",
                 where=str(path),
                 remedy=f'give a store first: restock export STORE PANEL --query "{OF_PANEL}"',
             )

@@ -130,7 +130,7 @@ class EvaluationSplit(Checked, frozen=True):
 
     @property
     def is_empty(self) -> bool:
-        """Return whether the split holds nothing out, whatever the rows."""
+        """Return whether the split never holds anything out."""
         return self.by == "none" or (self.share == 0 and not self.robots)
 
 
@@ -215,7 +215,7 @@ class Mixture(Checked, frozen=True):
     where: str | None = None  # SQL predicate: only these transitions
     safety: Safety | None = None
     odometry_as_command: bool = False  # use rows whose action is measured motion
-    max_age_days: Annotated[float, Meta(ge=0)] | None = None  # age of a logged row at `as_of`
+    max_age_days: Annotated[float, Meta(ge=0)] | None = None  # largest age of logged rows
     as_of: Annotated[datetime, Meta(tz=True)] | None = None  # date for ages; None: now
     max_age_env_steps: Count | None = None  # largest age of fresh rows
     max_rows_per_episode: AtLeastOne | None = None  # per stratum
@@ -223,7 +223,7 @@ class Mixture(Checked, frozen=True):
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
     uncertain: Uncertain = "nominal"  # nominal: uncertain labels do not count; keep: they do
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
-    # In which shares.
+    # Shares of strata and sources.
     sources: SourceShares = SourceShares()
     # Rows that a run is assumed to draw. A run replaces this number with its own.
     planned_draws: AtLeastOne = 20_000 * 128
@@ -231,7 +231,7 @@ class Mixture(Checked, frozen=True):
     each_condition: EachCondition | None = None
     max_replays_per_row: FromOne | None = None  # enforced by the run's learner
     shortfall: Shortfall = "redistribute"
-    # And how, within a stratum.
+    # How rows are drawn within a stratum.
     within: Within = "without_replacement"
     prioritised: Prioritised = Prioritised()
     correction: CorrectionRule = CorrectionRule()

@@ -299,7 +299,7 @@ def sampler_by_shares(
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
-    """Return the draws that a mixture's `planned_draws` stands for."""
+    """Return a mixture's `planned_draws` as draws online."""
     return PlannedDraws(online=float(mixture.planned_draws))
 
 

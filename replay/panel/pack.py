@@ -146,7 +146,7 @@ class PackedFile:
         self._writing[number] = self._writers.submit(self._store, number, held)
 
     def _wait(self, at_most: int) -> None:
-        """Wait until at most so many writes are pending, and raise the errors of finished ones."""
+        """Wait until at most `at_most` writes are pending; raise errors of finished ones."""
         while len(self._writing) > at_most:
             self._writing.pop(next(iter(self._writing))).result()
 

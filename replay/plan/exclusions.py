@@ -177,12 +177,7 @@ def leave_out_of_strata(
         if cap is not None:
             beyond = beyond_cap(table, column, stratum, cap, out.gone, mixture.seed)
             beyond_any |= beyond
-            out.add(
-                f"beyond the cap of rows an {name}"
-                if name == "episode"
-                else f"beyond the cap of rows a {name}",
-                beyond,
-            )
+            out.add(f"beyond the cap of rows per {name}", beyond)
     return beyond_any
 
 
@@ -271,9 +266,9 @@ def _choose_rows(table: pa.Table, mixture: Mixture) -> EvaluationRows:
         kept, of = (len(np.unique(codes(table, column)[rows])) for rows in (held, ~none))
         finer = "within_episode" if group == "episode" else "episode"
         warning = (
-            f"the evaluation split holds out {held.mean():.0%} of the rows, where {rule.share:.0%}"
-            f" were requested: {kept} of {counted(of, group)}, whole; [evaluation_split]"
-            f' by = "{finer}" comes nearer'
+            f"the evaluation split holds out {held.mean():.0%} of the rows instead of"
+            f" {rule.share:.0%}: {kept} of {counted(of, group)}, whole; [evaluation_split]"
+            f' by = "{finer}" is closer to that'
         )
     return EvaluationRows(held, none, rule.by, warning=warning)
 

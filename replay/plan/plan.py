@@ -231,7 +231,7 @@ def plan_panel(
     wanted = [store.name for store in mixture.sources.stores]
     if wanted != [store.name for store in others]:
         raise MixtureError(
-            f"it draws from other stores too ({', '.join(wanted)})",
+            f"the mixture also draws from other stores ({', '.join(wanted)})",
             remedy="`restock mix STORE --mixture FILE` opens them; from Python, `all_stores`",
         )
     strata = resolve_strata(mixture, conditions)
@@ -270,7 +270,7 @@ def plan_panel(
         out.reasons["odometry in place of a command"] = measured
     for other in others:
         if other.repeated_rows:
-            out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
+            out.reasons[f"of {other.name!r}, also in an earlier store"] = other.repeated_rows
     stratum, state_code = _deal_by_store(table, strata, member, stratum, state_code, ~out.gone)
     warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
     del member
@@ -278,7 +278,8 @@ def plan_panel(
     if out.gone.all():
         reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in out.reasons.items())
         raise MixtureError(
-            f"no row is left: {reasons}", remedy="correct what leaves out too much in the mixture"
+            f"no row is left: {reasons}",
+            remedy="loosen the mixture's limits that leave out too many rows",
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
     sources = _collect_sources(

@@ -80,7 +80,7 @@ class Journal:
             self.lines = _LINES.decode_lines(text[: text.rfind(b"\n") + 1])
         except msgspec.MsgspecError as error:
             raise LabelError(
-                f"holds a line that is no verdict: {error}",
+                f"contains an invalid line: {error}",
                 where=str(self.path),
                 remedy="remove or restore the line",
             ) from error

@@ -309,7 +309,7 @@ def _read_inputs(manifest: Mapping[str, Any]) -> AlignedInputs | str:
     """Read and align the inputs of a recording; return the reason if that fails."""
     path = Path(manifest["source_file"])
     if not path.exists():
-        return f"{path.name} is no longer where it was ingested from"
+        return f"{path.name} is no longer at the path it was ingested from"
     files = path.rglob("*") if path.is_dir() else [path]
     if sum(file.stat().st_size for file in files) > MAX_RECORDING_BYTES:
         return f"{path.name} is larger than {MAX_RECORDING_BYTES >> 20} MB"

@@ -362,7 +362,7 @@ class FreshRing(Stateful):
 
     @property
     def appended(self) -> int:
-        """Return the rows ever appended. If none are reserved, modulo capacity is the next slot."""
+        """Return the rows ever appended; if none are reserved, the next slot is this % capacity."""
         return self._reserve.appended
 
     @appended.setter

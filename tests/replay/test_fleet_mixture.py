@@ -112,7 +112,7 @@ def test_oversized_evaluation_split_warns(tmp_path):
     (warning,) = plan.warnings
     assert panel_of(two, text, tmp_path / "panel").warnings == [warning]
     assert Panel.open(tmp_path / "panel").warnings == [warning]
-    assert f"holds out {plan.evaluation_split.mean():.0%} of the rows, where 10% were" in warning
+    assert f"holds out {plan.evaluation_split.mean():.0%} of the rows instead of 10%" in warning
     assert "1 of 2 recordings, whole" in warning
     assert not planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4").warnings
 

@@ -157,7 +157,7 @@ def test_other_store_is_read_at_pinned_version(two_stores, store_path, shell):
     (other,) = document["other_stores"]
     assert (other["name"], other["version"]) == ("twin", 1)
     repeated = len(recording_transitions(3))
-    assert document["left_out"] == {"of 'twin', in a store before it too": repeated}
+    assert document["left_out"] == {"of 'twin', also in an earlier store": repeated}
     panel = Panel.open(out)
     assert panel.header.others[0].version == 1
     recordings = set(panel.meta["recording_id"].to_pylist())
@@ -192,7 +192,7 @@ def test_missing_other_store_is_reported(store_path, tmp_path):
     with Store(store_path) as store:
         with pytest.raises(StoreError, match=r"the mixture's store 'twin': no such store"):
             build_panel(store, mixture, tmp_path / "panel")
-        with pytest.raises(MixtureError, match=r"draws from other stores too \(twin\)"):
+        with pytest.raises(MixtureError, match=r"also draws from other stores \(twin\)"):
             plan_panel(store.connection, mixture, store.conditions())
 
 
