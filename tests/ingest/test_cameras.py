@@ -1,4 +1,4 @@
-"""Camera frames: those shown at steps are kept as recorded, the others are counted."""
+"""Camera frames: the current frame of each step is kept as recorded, others are counted."""
 
 import base64
 import hashlib

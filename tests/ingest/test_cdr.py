@@ -128,8 +128,7 @@ def test_random_definition_decodes_like_rosbags(text, seed, rows, longest, littl
     generator = MessageGenerator(store, np.random.default_rng(seed), longest)
     generated = [generator.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
     payloads = [
-        bytes(store.serialize_cdr(message_, "pkg/msg/T0", little_endian=little))
-        for message_ in generated
+        bytes(store.serialize_cdr(item, "pkg/msg/T0", little_endian=little)) for item in generated
     ] * (rows if alike else 1)
     assert_agrees_with_rosbags(message, payloads)
 
@@ -148,7 +147,7 @@ def test_random_ros1_definition_decodes_like_rosbags(text, seed, rows, longest, 
     channel = Channel(1, "/t", "pkg/T0", "ros1", "ros1msg", text.encode())
     generator = MessageGenerator(store, np.random.default_rng(seed), longest)
     generated = [generator.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
-    payloads = [bytes(store.serialize_ros1(message_, "pkg/msg/T0")) for message_ in generated]
+    payloads = [bytes(store.serialize_ros1(item, "pkg/msg/T0")) for item in generated]
     assert_agrees_with_rosbags(
         message_type(channel, "humble"), payloads * (rows if alike else 1), ros1=True
     )

@@ -139,8 +139,8 @@ def test_driver_does_not_depend_on_later_commands(plain):
     topics, late = taken_over(), START_NS + 5 * 10**9
     before = driver_per_step(topics, plain + SOURCES)
     for name in (NAV, TELEOP):
-        columns_ = topics[name][1]
-        columns_.fields["linear.x"][columns_.log_time_ns > late] = 0.9
+        topic = topics[name][1]
+        topic.fields["linear.x"][topic.log_time_ns > late] = 0.9
     other = driver_per_step(topics, plain + SOURCES)
     assert [p for s, p in before if s < 4.9] == [p for s, p in other if s < 4.9]
     assert {p for s, p in other if s > 5.2} == {"unknown"}

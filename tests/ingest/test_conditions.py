@@ -472,9 +472,7 @@ def test_noise_changes_labels_version_but_not_hash():
     noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")
     assert usual.hash == noisy.hash
     assert usual.labels_version != noisy.labels_version
-    near = next(
-        condition_ for condition_ in noisy.conditions if condition_.name == "near_collision"
-    )
+    near = next(rule for rule in noisy.conditions if rule.name == "near_collision")
     assert near.constants == {"lidar_noise_m": 0.05, "tight_clearance_m": 0.15}
     carried = parse_profile(profile_toml(noisy), where="its text")
     assert carried.labels_version == noisy.labels_version

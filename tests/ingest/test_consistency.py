@@ -74,56 +74,56 @@ def _ranges(count: int) -> dict[str, Any]:
 
 def shifted(topics: Topics, name: str, seconds: float) -> Topics:
     """Return the topics with the stamps of one topic shifted ahead."""
-    columns_ = topics[name]
-    stamp = np.asarray(columns_.fields["header.stamp"]) + round(seconds * NS)
-    return {**topics, name: replace(columns_, fields={**columns_.fields, "header.stamp": stamp})}
+    topic = topics[name]
+    stamp = np.asarray(topic.fields["header.stamp"]) + round(seconds * NS)
+    return {**topics, name: replace(topic, fields={**topic.fields, "header.stamp": stamp})}
 
 
 def scaled(topics: Topics, name: str, factor: float, *paths: str) -> Topics:
     """Return the topics with fields of one topic multiplied."""
-    columns_ = topics[name]
-    fields = {path: np.asarray(columns_.fields[path]) * factor for path in paths}
-    return {**topics, name: replace(columns_, fields={**columns_.fields, **fields})}
+    topic = topics[name]
+    fields = {path: np.asarray(topic.fields[path]) * factor for path in paths}
+    return {**topics, name: replace(topic, fields={**topic.fields, **fields})}
 
 
 def two_publishers(topics: Topics) -> Topics:
     """Return the topics with every third odometry message displaced, as from another publisher."""
-    columns_, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
-    fields = dict(columns_.fields)
+    topic, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    fields = dict(topic.fields)
     for axis, moved in (("x", 7.0), ("y", 2.0)):
         path = f"pose.pose.position.{axis}"
         fields[path] = np.asarray(fields[path]) + 0.1 * moved * third
-    return {**topics, "/odom": replace(columns_, fields=fields)}
+    return {**topics, "/odom": replace(topic, fields=fields)}
 
 
 def two_frames(topics: Topics) -> Topics:
     """Return the topics with every third odometry message in another frame."""
-    columns_, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    topic, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
     frames = np.where(third, "map", "odom").astype(object)
     return {
         **topics,
-        "/odom": replace(columns_, fields={**columns_.fields, "header.frame_id": frames}),
+        "/odom": replace(topic, fields={**topic.fields, "header.frame_id": frames}),
     }
 
 
 def wrapped(topics: Topics) -> Topics:
     """Return the topics with three yaw rates of 125 rad/s, from differences across the wrap."""
-    columns_ = topics["/odom"]
-    rate = np.asarray(columns_.fields[RATE]).copy()
+    topic = topics["/odom"]
+    rate = np.asarray(topic.fields[RATE]).copy()
     rate[[100, 301, 500]] -= 2 * np.pi / 0.05
-    return {**topics, "/odom": replace(columns_, fields={**columns_.fields, RATE: rate})}
+    return {**topics, "/odom": replace(topic, fields={**topic.fields, RATE: rate})}
 
 
 def slipping(topics: Topics) -> Topics:
     """Return the topics with wheels that turn twice as fast for a third of the time."""
-    columns_ = topics["/odom"]
-    time_s = (np.asarray(columns_.fields["header.stamp"]) - START_NS) / NS
+    topic = topics["/odom"]
+    time_s = (np.asarray(topic.fields["header.stamp"]) - START_NS) / NS
     factor = np.where(time_s % 15 < 5, 2.0, 1.0)
     path = "twist.twist.linear.x"
     return {
         **topics,
         "/odom": replace(
-            columns_, fields={**columns_.fields, path: np.asarray(columns_.fields[path]) * factor}
+            topic, fields={**topic.fields, path: np.asarray(topic.fields[path]) * factor}
         ),
     }
 

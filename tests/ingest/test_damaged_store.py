@@ -168,9 +168,9 @@ def test_temporarily_unreadable_file_is_not_dropped(tmp_path, monkeypatch, error
             yield source
 
     monkeypatch.setattr(Location, "reading", reading_failsrror)
-    with pytest.raises(StoreError, match=r"compacted/.* cannot be read") as error_:
+    with pytest.raises(StoreError, match=r"compacted/.* cannot be read") as caught:
         drop_damaged(writer)
-    assert "make the file readable" in str(error_.value)
+    assert "make the file readable" in str(caught.value)
     monkeypatch.undo()
     assert shown(tmp_path / "s") == UNDAMAGED_ROWS
 

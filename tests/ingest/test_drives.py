@@ -101,7 +101,7 @@ LIDAR = Lidar("laser", 360, 12.0, simulated=False)
 
 
 def test_disagreeing_traits_are_different_kinds():
-    robots_ = [
+    robots = [
         traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR),
         # beams differ, as the lidar turns at its own pace
         traits(command=TWIST, lidar=replace(LIDAR, beams=351)),
@@ -110,10 +110,10 @@ def test_disagreeing_traits_are_different_kinds():
         traits(command="ackermann_msgs/msg/AckermannDrive", lidar=LIDAR),
         traits(command=TWIST, frames="odom -> base_footprint", lidar=LIDAR),
     ]
-    assert robot_kinds(robots_) == [[0], [1], [2], [3], [4], [5]]
+    assert robot_kinds(robots) == [[0], [1], [2], [3], [4], [5]]
     # Without the robot of other frames nothing contradicts: the two with the same lidar are one
     # kind.
-    assert robot_kinds(robots_[:5]) == [[0, 1], [2], [3], [4]]
+    assert robot_kinds(robots[:5]) == [[0, 1], [2], [3], [4]]
 
 
 def test_common_topic_names_do_not_define_a_kind():

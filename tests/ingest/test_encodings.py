@@ -307,7 +307,7 @@ def test_invalid_protobuf_definition_is_rejected(definition, message):
         protobuf_type("lab.Scan", definition)
 
 
-# -- ROS 1 in MCAP, and what is not supported -----------------------------------------------------
+# -- ROS 1 in MCAP, and unsupported encodings -----------------------------------------------------
 
 
 def test_ros1_messages_in_mcap_decode_to_columns(tmp_path):

@@ -27,7 +27,7 @@ def transforms(
     lines: list[Line], *, latency_s: float = 0.002, ahead_s: float = 0.0
 ) -> TopicColumns:
     """Return a topic with one transform per message, in the order of the lines."""
-    each_single = offsets_of(np.ones(len(lines), np.int64))
+    singles = offsets_of(np.ones(len(lines), np.int64))
     stamp = START_NS + np.rint(np.array([line[0] for line in lines]) * 1e9).astype(np.int64)
     half = np.array([line[6] for line in lines]) / 2
     values = {
@@ -41,9 +41,7 @@ def transforms(
         "transform.rotation.z": np.sin(half),
         "transform.rotation.w": np.cos(half),
     }  # fmt: skip
-    fields = {
-        f"transforms[].{path}": Ragged(column, each_single) for path, column in values.items()
-    }
+    fields = {f"transforms[].{path}": Ragged(column, singles) for path, column in values.items()}
     assert set(fields) == set(FIELDS)
     log = stamp + round(latency_s * 1e9)
     return TopicColumns(log, log, fields)

@@ -336,7 +336,7 @@ def test_invalid_metadata_is_ignored(text, tmp_path):
 
 # -- the terminal ---------------------------------------------------------------------------
 
-CONTROL_CHARACTERS = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
+ESCAPES = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
 
 
 def test_control_characters_are_escaped(tmp_path, capsys):
@@ -344,23 +344,21 @@ def test_control_characters_are_escaped(tmp_path, capsys):
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema(
-            CONTROL_CHARACTERS, "ros2msg", f"pkg/{CONTROL_CHARACTERS} a".encode()
-        )
-        channel = writer.register_channel(CONTROL_CHARACTERS, "cdr", schema)
-        other = writer.register_channel(CONTROL_CHARACTERS + "2", CONTROL_CHARACTERS, 0)
+        schema = writer.register_schema(ESCAPES, "ros2msg", f"pkg/{ESCAPES} a".encode())
+        channel = writer.register_channel(ESCAPES, "cdr", schema)
+        other = writer.register_channel(ESCAPES + "2", ESCAPES, 0)
         for number in (channel, other):
             writer.add_message(number, 1, b"", 1)
-        writer.add_attachment(1, 1, CONTROL_CHARACTERS, CONTROL_CHARACTERS, b"")
-        writer.add_metadata(CONTROL_CHARACTERS, {})
+        writer.add_attachment(1, 1, ESCAPES, ESCAPES, b"")
+        writer.add_metadata(ESCAPES, {})
         writer.finish()
     bag = write_bag(tmp_path / "run", 2)
     text = (bag / "metadata.yaml").read_text()
-    escaped = json.dumps(CONTROL_CHARACTERS)
+    escaped = json.dumps(ESCAPES)
     text = text.replace("name: /bumper", f"name: {escaped}").replace("run.db3", "gone\\e[2J.db3")
     (bag / "metadata.yaml").write_text(text)
     with sqlite3.connect(next(bag.glob("*.db3"))) as base:
-        base.execute("UPDATE topics SET type = ? WHERE name = '/odom'", (CONTROL_CHARACTERS,))
+        base.execute("UPDATE topics SET type = ? WHERE name = '/odom'", (ESCAPES,))
     base.close()
     odd = write_mcap(tmp_path / "a\x1b[2Jb.mcap", 2)
     assert main(["info", str(path), str(bag), str(odd), str(tmp_path / "no\x1b[2J")]) == 2

@@ -99,31 +99,31 @@ def test_event_scores_match_pairwise_search(drawn, reach):
             for other in range(len(values))
         )
 
-    (score_,) = found
+    (result,) = found
     labelled_runs, true_runs = runs(holds), runs(true)
-    assert (score_.event_labelled, score_.event_support) == (len(labelled_runs), len(true_runs))
-    assert score_.event_right == sum(near(run, true) for run in labelled_runs)
-    assert score_.event_found == sum(near(run, holds) for run in true_runs)
+    assert (result.event_labelled, result.event_support) == (len(labelled_runs), len(true_runs))
+    assert result.event_right == sum(near(run, true) for run in labelled_runs)
+    assert result.event_found == sum(near(run, holds) for run in true_runs)
 
 
 @settings(max_examples=40)
 @given(episodes(), st.randoms())
 def test_perfect_labels_score_1_and_parts_add_up(drawn, chance):
     holds, true, episode, step = drawn
-    for score_ in score({"slip": true}, texts(true), episode, step, 0.2):
+    for result in score({"slip": true}, texts(true), episode, step, 0.2):
         assert (
-            score_.precision == score_.recall == score_.event_precision == score_.event_recall == 1
+            result.precision == result.recall == result.event_precision == result.event_recall == 1
         )
     whole = score({"slip": holds}, texts(true), episode, step, 0.2)
     cut = chance.randrange(int(episode[-1]) + 1)
     parts = [
-        score_
+        result
         for part in (episode < cut, episode >= cut)
-        for score_ in score(
+        for result in score(
             {"slip": holds[part]}, texts(true[part]), episode[part], step[part], 0.2
         )
     ]
     names = [field.name for field in fields(LabelScore) if field.name not in ("condition", "known")]
-    assert [[getattr(score_, name) for name in names] for score_ in pooled(parts)] == [
-        [getattr(score_, name) for name in names] for score_ in whole
+    assert [[getattr(result, name) for name in names] for result in pooled(parts)] == [
+        [getattr(result, name) for name in names] for result in whole
     ]

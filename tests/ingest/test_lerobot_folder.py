@@ -21,7 +21,7 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.input_columns import reckon
 from restock.replay.store.store import Store
 
-NAMES = ["arm_gripper.pos", "x.vel", "y.vel", "theta.vel"]  # those of a LeKiwi, with one joint
+NAMES = ["arm_gripper.pos", "x.vel", "y.vel", "theta.vel"]  # names of a LeKiwi with one joint
 FPS, FRAMES, EPISODES = 10, 40, 4
 VECTOR = {"dtype": "float32", "shape": [4], "names": NAMES}
 FILES = [f"data/chunk-000/file-00{number}.parquet" for number in range(2)]  # two episodes each
@@ -173,8 +173,7 @@ def test_images_are_read_and_videos_listed(tmp_path):
     folder = write_set(tmp_path / "set", {"images.front": image, "images.rear": video})
     for number, name in enumerate(FILES):
         images = [
-            {"bytes": picture_, "path": None}
-            for picture_ in pictures[number * 80 : number * 80 + 80]
+            {"bytes": content, "path": None} for content in pictures[number * 80 : number * 80 + 80]
         ]
         images[9]["bytes"] = None
         rewrite(folder / name, **{"images.front": pa.array(images)})

@@ -33,39 +33,41 @@ limits = st.builds(
 
 
 def limit_one(
-    limits_: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
+    robot_limits: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
 ) -> Limited:
-    return limit(limits_, np.array([command]), np.atleast_2d(clearance), np.array([before]))
+    return limit(robot_limits, np.array([command]), np.atleast_2d(clearance), np.array([before]))
 
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
-def test_limiter_never_increases_or_reverses_speed(limits_, command, clearance, before):
-    found = limit_one(limits_, command, clearance, before)
+def test_limiter_never_increases_or_reverses_speed(robot_limits, command, clearance, before):
+    found = limit_one(robot_limits, command, clearance, before)
     allowed, proposed = found.command[0], np.array(command)
     assert np.isfinite(allowed).all()
     assert (np.abs(allowed) <= np.abs(proposed)).all()
     assert (allowed * proposed >= 0).all()
-    assert (np.abs(allowed) <= limits_.fastest).all()
+    assert (np.abs(allowed) <= robot_limits.fastest).all()
     # Acceleration from the command in force stays within its limit.
     gained = np.abs(allowed) - np.maximum(np.array(before) * np.sign(allowed), 0.0)
-    assert (gained <= np.array(limits_.accel) * limits_.period_s + 1e-9).all()
+    assert (gained <= np.array(robot_limits.accel) * robot_limits.period_s + 1e-9).all()
     assert found.intervened[0] == (allowed != proposed).any()
 
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, clearances, speeds)
-def test_more_clearance_never_reduces_speed(limits_, command, near, more, before):
-    tight = limit_one(limits_, command, near, before).command
-    roomy = limit_one(limits_, command, np.minimum(near + more, TASK.range_max_m), before).command
+def test_more_clearance_never_reduces_speed(robot_limits, command, near, more, before):
+    tight = limit_one(robot_limits, command, near, before).command
+    roomy = limit_one(
+        robot_limits, command, np.minimum(near + more, TASK.range_max_m), before
+    ).command
     assert (np.abs(roomy) >= np.abs(tight) - 1e-9).all()
 
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
-def test_limiting_twice_changes_nothing(limits_, command, clearance, before):
-    once = limit_one(limits_, command, clearance, before).command[0]
-    again = limit_one(limits_, tuple(once.tolist()), clearance, before).command[0]
+def test_limiting_twice_changes_nothing(robot_limits, command, clearance, before):
+    once = limit_one(robot_limits, command, clearance, before).command[0]
+    again = limit_one(robot_limits, tuple(once.tolist()), clearance, before).command[0]
     np.testing.assert_allclose(again, once, atol=2e-6)
 
 
@@ -136,7 +138,7 @@ def test_limiter_table_does_not_change_profile_hash() -> None:
     text = profile_toml(PROFILE) + "\n[limiter]\nstop_m = 0.3\nmax_speed_mps = 0.5\n"
     profile = parse_profile(text, where="mine")
     assert profile.hash == PROFILE.hash
-    limits_ = Limits.of(profile.task, profile.robot, profile.limiter)
-    assert (limits_.stop_m, limits_.fastest) == (0.3, (0.5, 1.2))
-    assert limits_.hash != LIMITS.hash
-    assert limit_one(limits_, (1.0, 0.0), FREE, (0.5, 0.0)).command.tolist() == [[0.5, 0.0]]
+    robot_limits = Limits.of(profile.task, profile.robot, profile.limiter)
+    assert (robot_limits.stop_m, robot_limits.fastest) == (0.3, (0.5, 1.2))
+    assert robot_limits.hash != LIMITS.hash
+    assert limit_one(robot_limits, (1.0, 0.0), FREE, (0.5, 0.0)).command.tolist() == [[0.5, 0.0]]

@@ -24,13 +24,7 @@ from restock.replay.store.audit import load_thresholds, run_audits, shipped_audi
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import trace_row
 
-LIDAR_CONDITIONS = [
-    "blocked_aisle",
-    "closing_traffic",
-    "near_collision",
-    "plan_blocked",
-    "recovery",
-]
+NEED_LIDAR = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
 SCAN = re.search(r"\[inputs\.scan\].*?\n\n", WAREHOUSE, re.DOTALL)
 assert SCAN is not None
 BLIND = parse_profile(WAREHOUSE.replace(SCAN[0], ""), where="blind.toml")
@@ -95,11 +89,11 @@ def test_clearance_columns_are_null_without_lidar(drives, blind):
     observation = np.stack(rows["observation"].to_numpy())
     assert observation.shape == (len(rows), BLIND.task.observation_size)
     assert np.isfinite(observation).all()
-    assert sorted(unknown) == [(name, "no lidar") for name in LIDAR_CONDITIONS]
-    assert not set(outcome.conditions) & set(LIDAR_CONDITIONS)
+    assert sorted(unknown) == [(name, "no lidar") for name in NEED_LIDAR]
+    assert not set(outcome.conditions) & set(NEED_LIDAR)
     assert {*outcome.conditions, *outcome.exposures} >= {"wheel_slip", "slippery_floor"}
     for row in rows.to_pylist(maps_as_pydicts="strict"):
-        assert not {*row["probabilities"]} & set(LIDAR_CONDITIONS)
+        assert not {*row["probabilities"]} & set(NEED_LIDAR)
 
     seeing = ingest(drives / "seeing", load_profile("warehouse_amr"), store=None)
     assert seeing.manifest["unknown_conditions"] == []
@@ -162,14 +156,10 @@ def test_unknown_conditions_have_no_counts(blind):
     assert {line for line in cells if line[2] is None} == {(name, None, None) for name in outcomes}
     assert ("wheel_slip",) in missing
     assert not {(name,) for name in outcomes} & set(missing)
-    assert {name for name, rows in observed.items() if rows is None} == set(
-        LIDAR_CONDITIONS
-    ) - outcomes
+    assert {name for name, rows in observed.items() if rows is None} == set(NEED_LIDAR) - outcomes
     found = {finding.audit.name: finding for finding in findings}
     assert found["unknown_conditions"].status == "warn"
-    assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(
-        LIDAR_CONDITIONS
-    )
+    assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(NEED_LIDAR)
     assert not outcomes & {line["condition"] for line in found["rare_condition"].sample}
 
 
@@ -181,7 +171,7 @@ def test_one_drive_with_lidar_restores_zero_counts(drives, tmp_path):
         query = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
         assert store.sql(query).fetchall() == [(0,)]
         assert store.sql("FROM untold_conditions").fetchall() == []
-        assert len(store.sql("FROM unknown_conditions").fetchall()) == len(LIDAR_CONDITIONS)
+        assert len(store.sql("FROM unknown_conditions").fetchall()) == len(NEED_LIDAR)
 
 
 def test_quota_on_unknown_condition_reports_reason(blind):

@@ -359,7 +359,7 @@ def test_proposal_fits_its_robot(name, tmp_path):
     assert document["transitions"] > 5
 
 
-# -- advice, and what a profile then gives -----------------------------------------------------
+# -- advice, and rows of the proposed profile -----------------------------------------------------
 
 
 def test_unusual_commands_give_advice(tmp_path):

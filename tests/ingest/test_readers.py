@@ -191,7 +191,7 @@ def test_unreadable_folder_is_reported_and_skipped(tmp_path, monkeypatch, shell)
     (tmp_path / "gone.mcap").symlink_to("/not/mounted/gone.mcap")
     listed = Path.iterdir
 
-    # simulated, as root, who may run the tests, has access to everything
+    # simulated, as a test run by root may read everything
     def iterdir_denied(folder: Path) -> Iterator[Path]:
         if folder.name in ("locked", "lost+found"):
             raise PermissionError(errno.EACCES, "Permission denied", str(folder))
@@ -256,7 +256,7 @@ def test_truncated_mcap_is_rejected_or_salvaged(mcap: Path, tmp_path: Path) -> N
             assert "cut short" in recording.lost_messages[0].reason
             decoded = sum(len(columns) for columns in by_topic.values())
             assert decoded > 0.6 * share * 140
-            # Salvaged messages are those of the whole file, from the start of each topic.
+            # Salvaged messages are also in the whole file.
             for topic, columns in by_topic.items():
                 times = set(expected[topic].log_time_ns.tolist())
                 assert set(columns.log_time_ns.tolist()) <= times

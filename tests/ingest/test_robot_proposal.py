@@ -218,7 +218,7 @@ def description_topic(text: str) -> tuple[str, TopicColumns]:
 
 
 @pytest.mark.parametrize(
-    ("descriptions_", "outline", "source"),
+    ("texts", "outline", "source"),
     [
         # Its own description, although another comes first.
         (
@@ -234,14 +234,12 @@ def description_topic(text: str) -> tuple[str, TopicColumns]:
         ({"/robot1": SMALL}, None, None),
     ],
 )
-def test_each_robot_gets_its_own_outline(descriptions_, outline, source, tmp_path):
+def test_each_robot_gets_its_own_outline(texts, outline, source, tmp_path):
     short, whole = typed_topics(Drive(duration_s=1.0)), typed_topics(Drive(duration_s=2.0))
     used = ("/cmd_vel", "/amcl_pose", "/odom")
     topics = {f"/robot1{name}": short[name] for name in used}
     topics |= {f"/robot2{name}": whole[name] for name in used}
-    topics |= {
-        f"{name}/robot_description": description_topic(text) for name, text in descriptions_.items()
-    }
+    topics |= {f"{name}/robot_description": description_topic(text) for name, text in texts.items()}
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
         assert robots_in(recording) == ["/robot2", "/robot1"]
         found, notes = footprint_of(descriptions(recording))

@@ -137,9 +137,8 @@ def test_damaged_chunk_is_counted_once_per_topic(tmp_path: Path) -> None:
         (lost,) = recording.lost_messages
         assert (lost.topic, lost.messages) == (None, 2000 - num_read)
         reasons = [account.reasons for account in recording.accounts.values()]
-        assert [list(counts) for counts in reasons] == [
-            [lost.reason]
-        ] * 2  # each topic has its own share
+        # Each topic has its own share.
+        assert [list(counts) for counts in reasons] == [[lost.reason]] * 2
         assert sum(counts[lost.reason] for counts in reasons) == lost.messages
 
 

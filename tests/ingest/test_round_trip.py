@@ -1,23 +1,23 @@
-"""One contract, two sources: a recording is ingested to the very steps that the twin saw.
+"""Round trip: ingesting a recording of the twin gives the steps that the twin saw.
 
-Row by row, for both formats, for scripted and learned drivers, on slip, blocks and traffic, with
-sensor noise and latency. Nothing may differ but by what a real robot's messages lose too:
+Compared row by row, for both formats, scripted and learned drivers, slip, blocks and traffic,
+with sensor noise and latency. Rows may differ only by what a real robot's messages lose, too:
 
-| what | is off by at most | because |
+| quantity | largest error | reason |
 | --- | --- | --- |
 | action, episode, step, terminated, truncated, behaviour policy | 0 | |
 | gyro_yaw_rate, slip_yaw_rate | 2^-11 rad/s | the gyroscope's resolution is 2^-10 rad/s |
 | accel_x | 2^-9 / 5 | the accelerometer's is 2^-8 m/s2; the entry is a fifth of it |
-| localised_speed, lateral_speed, slip_speed | 1e-5 m/s | two poses in single precision, over .2 s |
+| localised_speed, lateral_speed, slip_speed | 1e-5 m/s | single-precision poses 0.2 s apart |
 | other scalars | 2e-6 | poses and odometry in single precision, headings as quaternions |
 | clearance_* | 2^-10 m, in metres | the lidar's resolution is 2^-9 m, and float32 |
-| closing_* | 1e-6 of the difference of the stored clearances | it is their difference |
-| reward | 1e-5 | the same; but where a clearance lies within the lidar's resolution of the
-threshold of tightness, that cost may be on either side |
-| action_probability | 1e-4 | it is published with four digits |
+| closing_* | 1e-6 from the difference of the stored clearances | defined as their difference |
+| reward | 1e-5 | as above; a clearance within the lidar's resolution of `tight_clearance_m` may
+cost on one side only |
+| action_probability | 1e-4 | published with four digits |
 
-A range within the lidar's resolution of the end of what counts (`range_max_m`) may count as free
-on one side alone: those entries, and no others, may differ by more, and they must be few.
+A range within the lidar's resolution of `range_max_m` may count as free on one side only. Only
+these entries may differ by more, and they must be few.
 """
 
 from dataclasses import dataclass, field
@@ -163,10 +163,7 @@ def _missions(plan: RecordingPlan, policy: Any) -> Any:
     return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
 
 
-FAST_CASES = (
-    "stand-in rosbag2",
-    "a run, perturbed, mcap",
-)  # together these two cover all differences
+FAST_CASES = ("stand-in rosbag2", "a run, perturbed, mcap")  # they cover all differences
 PARAMS = [
     pytest.param(case, id=name, marks=() if name in FAST_CASES else pytest.mark.long)
     for name, case in CASES.items()

@@ -167,7 +167,7 @@ def test_commit_with_lost_response_is_not_repeated(tmp_path, monkeypatch):
 
 
 def test_read_only_store_is_reported_as_not_writable(tmp_path, monkeypatch):
-    """Simulated error of delta-rs, as root, who may run the tests, may write everywhere."""
+    """Simulate the error of delta-rs, as a test run by root may write everywhere."""
     StoreWriter(tmp_path / "s").write(*one(1))
 
     def denied(self, *args, **options):
@@ -265,7 +265,7 @@ def test_floats_are_byte_stream_split_and_compressed(tmp_path):
 
 
 def test_unreadable_store_is_reported_as_permission_error(tmp_path: Path) -> None:
-    """Simulated error of delta-rs, as root, who may run the tests, may read everything."""
+    """Simulate the error of delta-rs, as a test run by root may read everything."""
     message = (
         "Generic LocalFileSystem error\n ↳ IO error for operation on /s/_delta_log\x1b[0m\n ↳ "
     )

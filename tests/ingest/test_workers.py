@@ -213,13 +213,13 @@ def test_killed_ingest_leaves_complete_recordings(bags, tmp_path, workers, after
     while any(map(_alive, children)):  # the workers end on their own
         time.sleep(0.01)
     before = rows(store)
-    process_ = subprocess.run(
+    second = subprocess.run(
         command(bags, store, "--workers", workers), capture_output=True, text=True
     )
-    assert process_.returncode == 0
+    assert second.returncode == 0
     recordings = {
         Path(recording["path"]).name: recording
-        for recording in json.loads(process_.stdout)["recordings"]
+        for recording in json.loads(second.stdout)["recordings"]
     }
     assert len(recordings) == 5
     assert {name: recording["transitions"] for name, recording in recordings.items()} == rows(store)
