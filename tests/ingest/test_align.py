@@ -120,7 +120,7 @@ def test_command_ticks_keep_minimum_interval():
 # -- faulty log times ------------------------------------------------------------------------------
 
 
-def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str, Any]:
+def with_log_times(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str, Any]:
     """Return the drive's typed topics with log times `log_time_ns(time, index in the topic)`."""
     typed = {}
     for name, (kind, topic) in typed_topics(drive).items():
@@ -131,7 +131,7 @@ def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str,
 
 
 def test_messages_logged_at_zero_are_dropped_and_counted(tmp_path, shell):
-    topics = logged_at(Drive(8.0), lambda time, index: 0 if index % 40 == 1 else time)
+    topics = with_log_times(Drive(8.0), lambda time, index: 0 if index % 40 == 1 else time)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     (row,) = shell.json("ingest", bag, "--dry-run", code=3)["recordings"]
     assert row["transitions"] > 25
@@ -167,7 +167,7 @@ def test_zero_header_stamps_are_reported_per_topic(tmp_path, shell):
 
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
 def test_identical_log_times_are_rejected(alignment, tmp_path, shell):
-    topics = logged_at(Drive(4.0), lambda time, place: 0)
+    topics = with_log_times(Drive(4.0), lambda time, place: 0)
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     profile = msgspec.structs.replace(
         load_profile("warehouse_amr"), clock=Clock(alignment=alignment)

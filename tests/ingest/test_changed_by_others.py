@@ -24,7 +24,7 @@ def store(tmp_path: Path) -> Path:
     return place
 
 
-def with_protocol(store: Path, name: str = TRANSITIONS, **protocol: object) -> Path:
+def write_protocol(store: Path, name: str = TRANSITIONS, **protocol: object) -> Path:
     """Commit a protocol change of a table, as Spark writes it."""
     log = store / name / "_delta_log"
     number = len(list(log.glob("*.json")))
@@ -42,7 +42,7 @@ def features(*names: str, reading: bool = True) -> dict[str, object]:
 def test_unknown_reader_feature_is_rejected_by_name(store, feature, shell):
     """Rows removed by deletion vectors are still in the Parquet files."""
     before = sum(shown(store).values())
-    with_protocol(store, **features(feature))
+    write_protocol(store, **features(feature))
     for verb in (["sql", str(store), "FROM coverage"], ["store", "compact", str(store)]):
         stderr = shell.err(*verb)
         assert f"its table `transitions` uses Delta's feature `{feature}`" in stderr
@@ -66,7 +66,7 @@ def test_unknown_reader_feature_is_rejected_by_name(store, feature, shell):
 @pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
 def test_unknown_writer_feature_prevents_writing(store, protocol, message, name):
     before = shown(store)
-    with_protocol(store, name, **protocol)
+    write_protocol(store, name, **protocol)
     writer = StoreWriter(store)
     files = {path for path in store.rglob("*") if path.is_file()}
     for write in (lambda: writer.write(*one(3)), lambda: compact(writer)):
@@ -99,7 +99,7 @@ def test_append_only_table_accepts_only_new_recordings(store, monkeypatch):
 
 
 def test_unused_features_do_not_prevent_writing(store):
-    with_protocol(
+    write_protocol(
         store,
         minReaderVersion=3,
         minWriterVersion=7,
@@ -114,7 +114,7 @@ def test_unused_features_do_not_prevent_writing(store):
     assert set(shown(store)) == {f"{1:016x}-b", f"{2:016x}-a"}
 
 
-def changed(store: Path, way: str) -> dict[str, int]:
+def change_rows(store: Path, way: str) -> dict[str, int]:
     """Change rows with Delta's own library, which writes string views; return rows per ingest."""
     table = DeltaTable(str(store / TRANSITIONS))
     if way == "deleted":
@@ -160,7 +160,7 @@ def assert_summaries_match_rows(store: Path) -> None:
 @pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
 def test_rows_changed_by_another_tool_are_used(store, way, shell):
     """Views use the rows, not summaries that another tool made stale."""
-    expected = changed(store, way)
+    expected = change_rows(store, way)
     kinds = {
         str(kind)
         for file in DeltaTable(str(store / TRANSITIONS)).file_uris()

@@ -119,7 +119,9 @@ def test_clock_map_is_monotonic_and_meets_newest_stamps(pairs: list[tuple[int, i
 PACES = [0.5, 0.97, 1.0]
 
 
-def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None):
+def play_at_pace(
+    topics: dict[str, TopicColumns], pace: float, pause: tuple[float, float] | None = None
+):
     """Return messages received at `pace` of log time; `pause` is (stamp, log time) in s."""
 
     def received(times: np.ndarray) -> np.ndarray:
@@ -135,7 +137,7 @@ def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, fl
     }
 
 
-def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
+def turning_drive(duration_s: float = 30.0) -> dict[str, TopicColumns]:
     """Return a drive whose speed command encodes the x at which it was given, hence its time."""
     topics = Drive(duration_s, goals=[(0.0, 40.0, 1.0)]).topics()
     command = topics["/cmd_vel"]
@@ -147,8 +149,8 @@ def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
 @pytest.mark.parametrize("pace", PACES)
 def test_command_and_state_of_row_are_within_one_hold(pace: float) -> None:
     profile = load_profile("warehouse_amr")
-    whole = steps_of(profile, turning())
-    steps = steps_of(profile, at_pace(turning(), pace))
+    whole = steps_of(profile, turning_drive())
+    steps = steps_of(profile, play_at_pace(turning_drive(), pace))
     assert len(steps) >= len(whole) - 2
     apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
     assert apart_s.max() <= 0.1 + 0.02  # a pose every 0.1 s, odometry (the reference) every 0.02 s
@@ -159,13 +161,13 @@ def test_command_and_state_of_row_are_within_one_hold(pace: float) -> None:
         assert steps.clock.pace is None
 
 
-def logged_s(stamp_ns: np.ndarray, pace: float) -> np.ndarray:
+def reception_s(stamp_ns: np.ndarray, pace: float) -> np.ndarray:
     """Return reception times of these stamps in s from the start, with the drive's latency."""
     return ((stamp_ns - START_NS) + LATENCY_NS) * 1e-9 / pace
 
 
 def test_set_clock_keeps_log_times_of_both_segments() -> None:
-    topics = turning()
+    topics = turning_drive()
     for columns in topics.values():
         late = columns.log_time_ns >= START_NS + 15 * NS
         if "header.stamp" in columns.fields:
@@ -180,7 +182,7 @@ class SlowSimulationDrive(Drive):
     """Drive in a simulation at 0.3 of real time."""
 
     def topics(self) -> dict[str, TopicColumns]:
-        return at_pace(super().topics(), 0.3)
+        return play_at_pace(super().topics(), 0.3)
 
 
 def test_log_time_of_rows_in_sql(tmp_path: Path) -> None:
@@ -190,14 +192,14 @@ def test_log_time_of_rows_in_sql(tmp_path: Path) -> None:
         rows = opened.sql(query).fetchnumpy()
     assert np.ptp(rows["logged_ns"]) * 1e-9 > 30
     seen_s = (rows["logged_ns"] - START_NS) * 1e-9
-    assert seen_s == pytest.approx(logged_s(rows["stamp_ns"], 0.3), abs=0.02)
+    assert seen_s == pytest.approx(reception_s(rows["stamp_ns"], 0.3), abs=0.02)
     assert np.abs(rows["logged_ns"] - rows["at_ns"]).max() < 1000
 
 
 @pytest.mark.parametrize("pace", PACES)
 def test_pause_loses_no_row_and_keeps_pairs(pace: float) -> None:
     profile = load_profile("warehouse_amr")
-    steps = steps_of(profile, at_pace(turning(), pace, pause=(12.0, 0.6)))
+    steps = steps_of(profile, play_at_pace(turning_drive(), pace, pause=(12.0, 0.6)))
     apart_s = np.abs(steps.signals["command_speed_mps"] - steps.signals["pose_x_m"]) / SPEED_MPS
     assert len(steps) >= 148
     assert apart_s.max() <= 0.12
@@ -205,8 +207,8 @@ def test_pause_loses_no_row_and_keeps_pairs(pace: float) -> None:
 
 def test_simulation_reset_starts_segment_with_own_map() -> None:
     profile = load_profile("warehouse_amr")
-    first = at_pace(turning(20.0), 0.5)
-    second = at_pace(turning(20.0), 0.9)
+    first = play_at_pace(turning_drive(20.0), 0.5)
+    second = play_at_pace(turning_drive(20.0), 0.9)
     end = max(int(c.log_time_ns[-1]) for c in first.values()) + NS - START_NS
     topics = {
         name: TopicColumns(

@@ -40,7 +40,7 @@ PLAIN = [("x", "f4"), ("y", "f4"), ("z", "f4")]
 KINDS = {"f4": 7, "f8": 8, "i2": 3}
 
 
-def packed(
+def pack_points(
     xyz: np.ndarray,
     layout: Any = PLAIN,
     order: str = "<",
@@ -71,7 +71,7 @@ def packed(
     }
 
 
-def scans_from(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, np.ndarray]:
+def read_scans(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, np.ndarray]:
     """Return the scans read from the columns of these clouds."""
     columns: dict[str, Any] = {}
     for path, place in (("name", 0), ("offset", 1), ("datatype", 2)):
@@ -85,7 +85,7 @@ def scans_from(clouds: list[dict[str, Any]], source: Any = SOURCE) -> dict[str, 
     return cloud_reduction(source, 0.05).apply(columns)
 
 
-def around(count: int = 1200, seed: int = 0) -> np.ndarray:
+def random_points(count: int = 1200, seed: int = 0) -> np.ndarray:
     """Return points all around, from the floor to above the robot, some of them NaN."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-6, -6, -1), (6, 6, 2), (count, 3)).astype(np.float32)
@@ -94,30 +94,30 @@ def around(count: int = 1200, seed: int = 0) -> np.ndarray:
 
 
 def test_beam_range_is_nearest_point_of_slice():
-    xyz = around().astype(np.float64)
+    xyz = random_points().astype(np.float64)
     expected = np.full(720, np.inf)
     for x, y, z in xyz[np.isfinite(xyz).all(axis=1)]:  # point by point, as the ROS node does
         if -0.2 <= z <= 0.6 and np.hypot(x, y) >= 0.05:
             beam = min(int((np.arctan2(y, x) + np.pi) / BEAM_RAD), 719)
             expected[beam] = min(expected[beam], np.hypot(x, y))
-    found = scans_from([packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")])])
+    found = read_scans([pack_points(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")])])
     np.testing.assert_allclose(found["ranges"][0], expected, rtol=1e-6)
     assert np.isfinite(expected).sum() > 100
     assert found["angle_min"][0] == pytest.approx(BEAM_RAD / 2 - np.pi)
 
 
 def test_point_layout_does_not_change_scan():
-    xyz = around()
-    found = scans_from(
+    xyz = random_points()
+    found = read_scans(
         [
-            packed(xyz),
-            packed(
+            pack_points(xyz),
+            pack_points(
                 xyz, [("intensity", "f4"), ("z", "f4"), ("y", "f4"), ("ring", "i2"), ("x", "f4")]
             ),
-            packed(xyz, step=32),
-            packed(xyz, order=">"),
-            packed(xyz, rows=16, pad=12),
-            packed(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")], order=">"),
+            pack_points(xyz, step=32),
+            pack_points(xyz, order=">"),
+            pack_points(xyz, rows=16, pad=12),
+            pack_points(xyz, [("x", "f8"), ("y", "f8"), ("z", "f8")], order=">"),
         ]
     )
     assert (found["ranges"] == found["ranges"][0]).all()
@@ -126,29 +126,29 @@ def test_point_layout_does_not_change_scan():
 def test_bearing_limits_and_upside_down_lidar():
     wall = np.array([[2.0, 1.0, 0.5], [2.0, -1.0, 0.5], [-3.0, 0.0, 0.5]])
     ahead = {"angle_rad": (-np.pi / 2, np.pi / 2)}
-    (seen,) = scans_from([packed(wall)], structs.replace(SOURCE, **ahead))["ranges"]
+    (seen,) = read_scans([pack_points(wall)], structs.replace(SOURCE, **ahead))["ranges"]
     assert seen.shape == (360,)
     assert np.isfinite(seen).sum() == 2
     turned = {"upside_down": True, "height_m": (-0.6, -0.4)}
-    (seen,) = scans_from([packed(wall)], structs.replace(SOURCE, **turned))["ranges"]
+    (seen,) = read_scans([pack_points(wall)], structs.replace(SOURCE, **turned))["ranges"]
     assert np.isfinite(seen).sum() == 3
 
 
-WHOLE, NOTHING = packed(around()), np.full((4, 3), np.nan)
+WHOLE, NOTHING = pack_points(random_points()), np.full((4, 3), np.nan)
 UNREAD = "cut short, or has no x, y, z as floats"
 UNSEEN = "no beam has a valid range"
 UNUSABLE = {
     "truncated": (WHOLE | {"data": WHOLE["data"][:-5]}, UNREAD),
-    "without_z": (packed(around(), PLAIN[:2]), UNREAD),
-    "integers": (packed(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
+    "without_z": (pack_points(random_points(), PLAIN[:2]), UNREAD),
+    "integers": (pack_points(np.ones((64, 3)), [(axis, "i2") for axis in "xyz"]), UNREAD),
     "offset_beyond_point": (WHOLE | {"point_step": 8}, UNREAD),
-    "overlapping_rows": (packed(around(), rows=16) | {"row_step": 0}, UNREAD),
-    "empty": (packed(np.zeros((0, 3))), UNSEEN),
-    "all_nan": (packed(NOTHING), UNSEEN),
+    "overlapping_rows": (pack_points(random_points(), rows=16) | {"row_step": 0}, UNREAD),
+    "empty": (pack_points(np.zeros((0, 3))), UNSEEN),
+    "all_nan": (pack_points(NOTHING), UNSEEN),
 }
 
 
-def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str = "") -> Path:
+def write_cloud_bag(folder: Path, spoilt: dict[str, Any] | None = None, frame: str = "") -> Path:
     """Write a drive whose scans are clouds; those after 3 s are `spoilt`."""
     folder.mkdir()
     drive, bag = write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), folder / "drive"), folder / "bag"
@@ -176,7 +176,7 @@ def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str =
                 ]
             ).astype(np.float32)
             late = now_ns - reader.start_time > 3 * 10**9
-            cloud = spoilt if spoilt is not None and late else packed(xyz)
+            cloud = spoilt if spoilt is not None and late else pack_points(xyz)
             names = [point(name=n, offset=o, datatype=k, count=1) for n, o, k in cloud["fields"]]
             message = TYPES.types["sensor_msgs/msg/PointCloud2"](
                 header=replace(scan.header, frame_id=frame),
@@ -188,7 +188,7 @@ def with_clouds(folder: Path, spoilt: dict[str, Any] | None = None, frame: str =
 
 
 def test_cloud_and_scan_give_same_clearance(tmp_path):
-    bag = with_clouds(tmp_path / "clouds")
+    bag = write_cloud_bag(tmp_path / "clouds")
     by_cloud = steps_in(bag, PROFILE)
     by_scan = steps_in(tmp_path / "clouds" / "drive", WAREHOUSE)
     assert by_cloud.problem == by_scan.problem
@@ -207,18 +207,18 @@ def test_cloud_and_scan_give_same_clearance(tmp_path):
 @pytest.mark.parametrize("kind", UNUSABLE)
 def test_unusable_cloud_drops_steps_with_reason(kind, tmp_path):
     spoilt, reason = UNUSABLE[kind]
-    problems = steps_in(with_clouds(tmp_path / "clouds", spoilt), PROFILE).problem
+    problems = steps_in(write_cloud_bag(tmp_path / "clouds", spoilt), PROFILE).problem
     assert set(problems) == {"", f"scan: {reason}"}
 
 
 def test_cloud_in_fixed_frame_is_rejected(tmp_path):
-    bag = with_clouds(tmp_path / "clouds", frame="robot1/odom")
+    bag = write_cloud_bag(tmp_path / "clouds", frame="robot1/odom")
     with pytest.raises(RecordingError, match="its points in the frame robot1/odom"):
         steps_in(bag, PROFILE)
 
 
 def test_live_observer_and_ingest_agree_on_clouds(tmp_path):
-    bag = with_clouds(tmp_path / "clouds", UNUSABLE["truncated"][0])
+    bag = write_cloud_bag(tmp_path / "clouds", UNUSABLE["truncated"][0])
     alike = seen_alike(bag, parse_profile(PROFILE, where="p"), steps_in(bag, PROFILE))
     assert min(alike[""], alike[f"scan: {UNREAD}"]) > 5
 
@@ -238,7 +238,7 @@ def test_invalid_cloud_settings_are_rejected(old, new, message):
 
 
 def test_proposal_contains_cloud_settings(tmp_path, shell):
-    bag, profile = with_clouds(tmp_path / "clouds"), tmp_path / "robot.toml"
+    bag, profile = write_cloud_bag(tmp_path / "clouds"), tmp_path / "robot.toml"
     assert "a slice can be read as a scan" in shell.err(
         "profile", "new", bag, "--out", profile, code=0
     )

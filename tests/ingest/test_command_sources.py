@@ -44,7 +44,7 @@ def twist_columns(time_s: Any, speed_mps: Any, turn_radps: Any) -> TopicColumns:
     return columns(time_s, fields, stamped=False)
 
 
-def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
+def takeover_drive(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
     """Return a drive of navigation, with a person driving from 4 to 7 s, through a multiplexer."""
     drive = Drive(duration_s)
     names = {"/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped"}
@@ -84,7 +84,7 @@ def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
 def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return the text of a proposal without its command sources."""
     folder = tmp_path_factory.mktemp("plain")
-    proposed(write_topics(taken_over(), folder / "bag"), file := folder / "p.toml")
+    proposed(write_topics(takeover_drive(), folder / "bag"), file := folder / "p.toml")
     kept, skip = [], False
     for line in file.read_text().splitlines():
         skip = line.startswith("[command_sources") or (skip and not line.startswith("["))
@@ -92,7 +92,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     return "\n".join(kept) + "\n"
 
 
-def profile_of(plain: str, folder: Path, sources: str) -> Path:
+def write_profile(plain: str, folder: Path, sources: str) -> Path:
     """Write the proposal with these command sources."""
     (folder / "p.toml").write_text(plain + sources)
     return folder / "p.toml"
@@ -116,8 +116,8 @@ def driver_per_step(
 
 
 def test_driver_is_source_of_command_in_force(plain, tmp_path, capsys):
-    bag = write_topics(taken_over(), tmp_path / "bag")
-    rows = driver_per_row(bag, profile_of(plain, tmp_path, SOURCES), tmp_path / "s")
+    bag = write_topics(takeover_drive(), tmp_path / "bag")
+    rows = driver_per_row(bag, write_profile(plain, tmp_path, SOURCES), tmp_path / "s")
     assert len(rows) > 50
     by_hand = [s for s, policy in rows if policy == "teleop"]
     assert min(by_hand) == pytest.approx(TAKEN_OVER_S[0], abs=0.2)
@@ -128,7 +128,7 @@ def test_driver_is_source_of_command_in_force(plain, tmp_path, capsys):
 
 
 def test_pressed_button_names_driver_without_source(plain):
-    topics = taken_over()
+    topics = takeover_drive()
     del topics[TELEOP], topics[NAV]
     rows = driver_per_step(topics, plain + PRESSED)
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
@@ -136,7 +136,7 @@ def test_pressed_button_names_driver_without_source(plain):
 
 
 def test_driver_does_not_depend_on_later_commands(plain):
-    topics, late = taken_over(), START_NS + 5 * 10**9
+    topics, late = takeover_drive(), START_NS + 5 * 10**9
     before = driver_per_step(topics, plain + SOURCES)
     for name in (NAV, TELEOP):
         topic = topics[name][1]
@@ -149,7 +149,7 @@ def test_driver_does_not_depend_on_later_commands(plain):
 def test_drivers_are_unknown_without_sources(plain):
     hashes = {parse_profile(text, where="p").hash for text in (plain + SOURCES, plain)}
     assert len(hashes) == 2
-    topics = taken_over()
+    topics = takeover_drive()
     del topics[NAV], topics[TELEOP], topics[JOY]
     assert {policy for _, policy in driver_per_step(topics, plain + SOURCES)} == {"unknown"}
 
@@ -164,9 +164,9 @@ max_age_s = 0.4
 """
 
 
-def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
+def smoothed_drive(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
     """Return the drive with its output smoothed to 20 Hz, and times `limit` from 9 to 10 s."""
-    topics = taken_over()
+    topics = takeover_drive()
     chosen = topics.pop(OUT)[1]
     reported = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
     reported_s = (chosen.log_time_ns - START_NS) * 1e-9
@@ -183,14 +183,14 @@ def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
 @pytest.mark.parametrize("limit", [1.0, 0.4])
 def test_source_is_followed_through_smoother(plain, limit):
     """A smoothed command equals no command of any source."""
-    rows = driver_per_step(smoothed(limit), plain + SOURCES + THROUGH)
+    rows = driver_per_step(smoothed_drive(limit), plain + SOURCES + THROUGH)
     assert len(rows) > 50
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
 def test_driver_is_unknown_while_multiplexer_is_silent(plain):
-    topics, text = smoothed(), plain + SOURCES + THROUGH
+    topics, text = smoothed_drive(), plain + SOURCES + THROUGH
     chosen = topics[MUX][1]
     silent = (chosen.log_time_ns >= START_NS + 8 * NS) & (chosen.log_time_ns <= START_NS + 10 * NS)
     with_gap = topics | {MUX: (TWIST, without(chosen, ~silent))}
@@ -219,8 +219,8 @@ def test_sources_without_driver_information_are_rejected(text, message):
 
 
 def test_missing_button_field_is_reported_with_its_key(plain, tmp_path, shell):
-    bag = write_topics(taken_over(2.0), tmp_path / "bag")
-    profile = profile_of(plain, tmp_path, PRESSED.replace("buttons", "button"))
+    bag = write_topics(takeover_drive(2.0), tmp_path / "bag")
+    profile = write_profile(plain, tmp_path, PRESSED.replace("buttons", "button"))
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in shell.err(
         "profile", "check", profile, bag
     )
@@ -228,7 +228,7 @@ def test_missing_button_field_is_reported_with_its_key(plain, tmp_path, shell):
 
 def test_proposal_finds_multiplexer_by_its_commands(tmp_path):
     """Topic names do not matter: the output is the topic that repeats the others' commands."""
-    topics = taken_over()
+    topics = takeover_drive()
     topics["/cmd_vel_out_of_planner"] = topics.pop(NAV)
     topics["/wheels/command"] = topics.pop(OUT)
     bag = write_topics(topics, tmp_path / "bag")
@@ -242,7 +242,7 @@ def test_proposal_finds_multiplexer_by_its_commands(tmp_path):
 
 
 def test_proposed_driver_of_teleop_only_command(tmp_path):
-    topics = {n: t for n, t in taken_over().items() if n not in (NAV, TELEOP, JOY)}
+    topics = {n: t for n, t in takeover_drive().items() if n not in (NAV, TELEOP, JOY)}
     topics["/teleop/cmd_vel"] = topics.pop(OUT)
     bag = write_topics(topics, tmp_path / "bag")
     assert proposed(bag, file := tmp_path / "p.toml").behaviour_policy == "teleop"
@@ -254,7 +254,7 @@ TAKEN_S = (4.0, 8.0)
 Topics = dict[str, Any]
 
 
-def driven() -> Topics:
+def drive_without_driver() -> Topics:
     """Return a drive of a robot whose logs do not name the driver."""
     topics: Topics = typed_topics(Drive(duration_s=12.0))
     del topics["/behaviour_policy"]
@@ -265,7 +265,7 @@ def with_takeover(kind: str = BOOL) -> Topics:
     at_s = np.arange(0, 12, 0.2)
     pressed = (at_s >= TAKEN_S[0]) & (at_s < TAKEN_S[1])
     data = pressed if kind == BOOL else np.where(pressed, "yes", "no").astype(object)
-    return driven() | {TAKEOVER: (kind, columns(at_s, {"data": data}, stamped=False))}
+    return drive_without_driver() | {TAKEOVER: (kind, columns(at_s, {"data": data}, stamped=False))}
 
 
 def with_shadow_policy() -> Topics:
@@ -275,7 +275,7 @@ def with_shadow_policy() -> Topics:
     slow = {"linear.x": half, "angular.z": 0 * half}
     chosen = {"data": np.ones(len(at_s), np.int16)}
     rule = {"data": (at_s > 6).astype(np.uint8)}
-    return driven() | {
+    return drive_without_driver() | {
         PROPOSAL: (TWIST, columns(at_s, slow | {"linear.x": 2 * half}, stamped=False)),
         SHADOW: (TWIST, columns(at_s, slow, stamped=False)),
         ACTION: ("std_msgs/msg/Int16", columns(at_s, chosen, stamped=False)),

@@ -59,7 +59,7 @@ def assert_views_match_scan(path: Path | str) -> None:
             by_summary, by_scan = store.sql(f"FROM {view}"), scanned.sql(f"FROM {view}")
             assert by_summary.columns == by_scan.columns
             assert by_summary.types == by_scan.types, view
-            assert rounded(by_summary) == rounded(by_scan), view
+            assert round_rows(by_summary) == round_rows(by_scan), view
         plan = str(store.sql("EXPLAIN FROM coverage_by_condition").fetchall())
         assert "cells" in plan
         count = store.sql("SELECT count(*) FROM transitions")
@@ -67,7 +67,7 @@ def assert_views_match_scan(path: Path | str) -> None:
         assert count.fetchall() == scanned.sql("SELECT count(*) FROM transitions").fetchall()
 
 
-def rounded(relation: duckdb.DuckDBPyRelation) -> list[tuple[object, ...]]:
+def round_rows(relation: duckdb.DuckDBPyRelation) -> list[tuple[object, ...]]:
     """Return rounded rows, as sums in another order differ in their last digits."""
     return [
         tuple(round(value, 6) if isinstance(value, float) else value for value in row)

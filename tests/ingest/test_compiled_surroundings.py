@@ -50,7 +50,7 @@ def assert_identical(plain: Any, fast: Any) -> None:
     np.testing.assert_array_equal(plain, fast, strict=True)
 
 
-def plans_of(rng: np.random.Generator, count: int, points: int) -> Any:
+def random_plans(rng: np.random.Generator, count: int, points: int) -> Any:
     """Return random-walk plans, some on a grid (many equal distances), some that end early."""
     plans = rng.normal(size=(count, points, 2)).cumsum(axis=1)
     on_grid = rng.random(count) < 0.4
@@ -64,7 +64,7 @@ def plans_of(rng: np.random.Generator, count: int, points: int) -> Any:
 @given(seeds, sizes, st.integers(2, 40), spoilt)
 def test_route_view_equals_numpy(seed: int, count: int, points: int, share: float) -> None:
     rng = np.random.default_rng(seed)
-    plans, pose = plans_of(rng, count, points), np.round(rng.normal(size=(3, count)) * 3, 1)
+    plans, pose = random_plans(rng, count, points), np.round(rng.normal(size=(3, count)) * 3, 1)
     put_nonfinite(rng, share, plans, pose)
     plain, fast = run_both(lambda: view_route(plans, *pose, plan_distances_m(TASK)))
     assert_identical(plain.look_ahead_m, fast.look_ahead_m)
@@ -77,7 +77,7 @@ def test_route_view_equals_numpy(seed: int, count: int, points: int, share: floa
 def test_returns_on_plan_equal_numpy(seed, count, sectors, share):
     rng = np.random.default_rng(seed)
     task = msgspec.structs.replace(TASK, sectors=sectors)
-    clearance, plan = rng.uniform(0, 9, (count, sectors)), plans_of(rng, count, 7)
+    clearance, plan = rng.uniform(0, 9, (count, sectors)), random_plans(rng, count, 7)
     clearance[clearance > 8] = task.range_max_m
     put_nonfinite(rng, share, clearance, plan)
     plain, fast = run_both(lambda: returns_on_plan(task, clearance, plan))

@@ -51,13 +51,13 @@ def drive(**unknown: Any) -> Topics:
     return topics
 
 
-def found_in(topics: Topics) -> Steps:
+def steps_from(topics: Topics) -> Steps:
     return steps_of(load_profile("warehouse_amr"), {name: one for name, (_, one) in topics.items()})
 
 
 def test_imu_without_gyro_falls_back_to_wheels(tmp_path: Path) -> None:
     topics = drive(angular_velocity=slice(None))
-    steps = found_in(topics)
+    steps = steps_from(topics)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
     assert steps.signals["accel_x_mps2"] == pytest.approx(0.3)
     reported = (
@@ -75,7 +75,7 @@ def test_imu_without_gyro_falls_back_to_wheels(tmp_path: Path) -> None:
 def test_partly_unknown_gyro_falls_back_to_wheels() -> None:
     """The gyroscope fails half way, and there is no accelerometer."""
     half = slice(150, None)
-    steps = found_in(drive(angular_velocity=half, linear_acceleration=slice(None)))
+    steps = steps_from(drive(angular_velocity=half, linear_acceleration=slice(None)))
     gyro = steps.signals["gyro_yaw_rate_radps"]
     measured = np.arange(len(gyro)) < len(gyro) // 2 + 1
     assert gyro[measured][:-1] == pytest.approx(0.1)
@@ -85,7 +85,7 @@ def test_partly_unknown_gyro_falls_back_to_wheels() -> None:
 
 
 def test_known_covariance_keeps_gyro() -> None:
-    steps = found_in(drive(angular_velocity=slice(0)))
+    steps = steps_from(drive(angular_velocity=slice(0)))
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(0.1)
     assert not [note for note in steps.notes if "estimate" in note]
 
@@ -96,7 +96,7 @@ def test_odometry_without_speeds_gives_no_rows() -> None:
     unknown = np.zeros((len(topics["/odom"][1]), 36))
     unknown[:, 0] = -1
     fields["twist.covariance"] = unknown
-    steps = found_in(topics)
+    steps = steps_from(topics)
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
@@ -154,7 +154,7 @@ def test_minus_infinity_beams_are_near_obstacles() -> None:
         ranges[50] = -np.inf if name == "reported" else 0.0  # covered: no beam has a range
         topics = drive()
         topics["/scan"] = ("sensor_msgs/msg/LaserScan", columns(tenth, scans(ranges)))
-        found.append(found_in(topics))
+        found.append(steps_from(topics))
     measured, reported = found
     usable = np.array(measured.problem) == ""
     assert reported.problem == measured.problem

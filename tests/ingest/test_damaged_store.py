@@ -21,7 +21,7 @@ from restock.ingest.store.writer import StoreWriter, compact
 from restock.replay.store.query import fetch
 from restock.replay.store.store import Store
 
-DAMAGES = ("cut", "missing", "a page", "numbers")
+DAMAGES = ("cut", "missing", "page", "values")
 
 
 def damage(place: Path | str, file: str, how: str) -> None:
@@ -34,7 +34,7 @@ def damage(place: Path | str, file: str, how: str) -> None:
         return
     if how == "cut":
         content = content[:1000]
-    elif how == "numbers":  # values still decode, so only the page checksum reveals it
+    elif how == "values":  # values still decode, so only the page checksum reveals it
         at = len(content) // 3
         content = content[:at] + bytes(b ^ 0x55 for b in content[at : at + 40]) + content[at + 40 :]
     else:  # the footer stays valid
@@ -43,7 +43,7 @@ def damage(place: Path | str, file: str, how: str) -> None:
         sink.write(content)
 
 
-def active(place: Path | str, name: str) -> list[str]:
+def active_files(place: Path | str, name: str) -> list[str]:
     return [f"{name}/{file.path}" for file in StoreWriter(place).files(name)]
 
 
@@ -51,7 +51,7 @@ def expected(*ingests: tuple[int, str, int]) -> dict[str, int]:
     return {f"{n:016x}-{name}": len(one(n, name, seed)[1]) for n, name, seed in ingests}
 
 
-def compacted_store(place: Path | str) -> StoreWriter:
+def write_compacted(place: Path | str) -> StoreWriter:
     """Write three recordings, compact them into one file, and ingest the second again."""
     writer = StoreWriter(place)
     writer.write_all([one(1), one(2), one(3)])
@@ -68,10 +68,10 @@ UNDAMAGED_ROWS = expected((1, "a", 0), (2, "b", 7), (3, "a", 0))
     "names", one_in(3, [[TRANSITIONS, RECORDINGS], [TRANSITIONS], [RECORDINGS]])
 )
 def test_damaged_compacted_file_is_rebuilt_from_sources(tmp_path, names, how):
-    writer = compacted_store(tmp_path / "s")
+    writer = write_compacted(tmp_path / "s")
     before = writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist()
     damaged = [
-        file for name in names for file in active(tmp_path / "s", name) if "compacted" in file
+        file for name in names for file in active_files(tmp_path / "s", name) if "compacted" in file
     ]
     for file in damaged:
         damage(tmp_path / "s", file, how)
@@ -89,9 +89,9 @@ def test_damaged_compacted_file_is_rebuilt_from_sources(tmp_path, names, how):
 @pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
 @pytest.mark.parametrize("how", one_in(2, DAMAGES[:2]))
 def test_lost_recordings_are_listed_and_can_be_reingested(place, name, how):
-    writer = compacted_store(place)
+    writer = write_compacted(place)
     writer.clean(retention_hours=0)  # removes the source files of the compacted file
-    damage(place, next(file for file in active(place, name) if "compacted" in file), how)
+    damage(place, next(file for file in active_files(place, name) if "compacted" in file), how)
     with pytest.raises(StoreError, match=r"restock store compact .* --drop-damaged"):
         StoreWriter(place).write(*one(1, "c"))
     result = drop_damaged(writer)
@@ -112,7 +112,7 @@ def test_rows_of_replaced_ingest_are_not_restored(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
     writer.write(*one(1, "b"))  # with the same number of rows
-    (file,) = active(tmp_path / "s", TRANSITIONS)
+    (file,) = active_files(tmp_path / "s", TRANSITIONS)
     damage(tmp_path / "s", file, "cut")
     result = drop_damaged(writer)
     assert (result.joined_again, result.dropped) == ([], [file])
@@ -157,7 +157,7 @@ def test_damaged_rows_need_forced_ingest(tmp_path, shell):
 
 @pytest.mark.parametrize("error", [PermissionError(13, "denied"), OSError(5, "disk")])
 def test_temporarily_unreadable_file_is_not_dropped(tmp_path, monkeypatch, error):
-    writer = compacted_store(tmp_path / "s")
+    writer = write_compacted(tmp_path / "s")
     reading = Location.reading
 
     @contextmanager
@@ -180,10 +180,13 @@ def test_rows_with_changed_bytes_are_never_used(tmp_path, shell):
     writer = StoreWriter(place)
     writer.write_all([one(1), one(2)])
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
-    damage(place, file, "numbers")
-    before, version = active(place, TRANSITIONS), writer.path.open_table(TRANSITIONS).version()
+    damage(place, file, "values")
+    before, version = (
+        active_files(place, TRANSITIONS),
+        writer.path.open_table(TRANSITIONS).version(),
+    )
     assert f"its file {file} cannot be read" in shell.err("store", "compact", place)
-    assert active(place, TRANSITIONS) == before
+    assert active_files(place, TRANSITIONS) == before
     assert writer.path.open_table(TRANSITIONS).version() == version
     assert not [path for path in files_of(place) if "transitions/compacted" in path]
     with pytest.raises(StoreError, match=f"{file} cannot be read"):
@@ -195,8 +198,8 @@ def test_rows_with_changed_bytes_are_never_used(tmp_path, shell):
 
 
 def test_concurrent_drops_of_one_file_drop_it_once(tmp_path, before_commit):
-    writer = compacted_store(tmp_path / "s")
-    file = next(path for path in active(tmp_path / "s", TRANSITIONS) if "compacted" in path)
+    writer = write_compacted(tmp_path / "s")
+    file = next(path for path in active_files(tmp_path / "s", TRANSITIONS) if "compacted" in path)
     damage(tmp_path / "s", file, "cut")
 
     def drop_concurrently():
@@ -223,10 +226,14 @@ def test_clean_and_fold_survive_a_damaged_manifest(writer, tmp_path, monkeypatch
 
 
 def test_rows_lost_with_their_manifests_are_counted(tmp_path):
-    writer = compacted_store(tmp_path / "s")
+    writer = write_compacted(tmp_path / "s")
     writer.clean(retention_hours=0)
     for name in (TRANSITIONS, RECORDINGS):
-        damage(tmp_path / "s", next(f for f in active(tmp_path / "s", name) if "comp" in f), "cut")
+        damage(
+            tmp_path / "s",
+            next(f for f in active_files(tmp_path / "s", name) if "comp" in f),
+            "cut",
+        )
     result = drop_damaged(writer)
     assert len(result.dropped) == 2
     assert (result.lost, result.unnamed_transitions) == (
@@ -238,10 +245,10 @@ def test_rows_lost_with_their_manifests_are_counted(tmp_path):
 
 def test_compact_command_lists_losses_and_exits_3(tmp_path, shell):
     place = tmp_path / "s"
-    writer = compacted_store(place)
+    writer = write_compacted(place)
     assert "no file is damaged" in shell.err("store", "compact", place, "--drop-damaged", code=0)
     writer.clean(retention_hours=0)
-    file = next(path for path in active(place, TRANSITIONS) if "compacted" in path)
+    file = next(path for path in active_files(place, TRANSITIONS) if "compacted" in path)
     damage(place, file, "cut")
     for options in (["--dry-run"], ["--json"]):
         out, stderr = shell.printed("store", "compact", place, "--drop-damaged", *options, code=3)
@@ -288,7 +295,7 @@ def test_first_ingest_killed_between_tables_can_continue(tmp_path):
 
 @pytest.mark.usefixtures("writer")
 def test_damage_without_file_name_has_remedy(tmp_path):
-    damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "a page")
+    damage(tmp_path / "s", active_files(tmp_path / "s", TRANSITIONS)[0], "page")
     with Store(tmp_path / "s") as store:
         for text in ("SELECT nothing FROM transitions", "FROM read_csv('no.csv')"):
             with pytest.raises(QueryError):
@@ -302,7 +309,7 @@ LOG_DAMAGES = {
     "empty": lambda content: b"",
     "blank": lambda content: b"\n\n",
     "cut": lambda content: content[: len(content) // 2],
-    "cut after its first line": lambda content: content.splitlines(keepends=True)[0],
+    "cut after first line": lambda content: content.splitlines(keepends=True)[0],
     "other bytes": lambda content: bytes(len(content)),
     "no commit": lambda content: b"[]\n",
 }

@@ -50,7 +50,7 @@ MSG = f"uint8 level 1  # of the tank\nHeader header\n# the end\n\n{RULE}MSG: a_m
 MSG += "float32 left\nfloat64 right\n"
 
 
-def recorded(path: Path, form: str, text: str, name: str = "a_msgs/msg/Twist") -> Path:
+def write_recording(path: Path, form: str, text: str, name: str = "a_msgs/msg/Twist") -> Path:
     return write_channels(path, ("/twist", "cdr", name, form, text.encode(), [PAYLOAD]))
 
 
@@ -72,7 +72,7 @@ def recorded(path: Path, form: str, text: str, name: str = "a_msgs/msg/Twist") -
     ids=["idl", "idl CRLF", "idl blank", "idl guard", "msg", "msg CRLF", "msg blank", "msg BOM"],
 )
 def test_recorded_definitions_are_parsed(tmp_path: Path, form: str, text: str) -> None:
-    with open_recording(recorded(tmp_path / "run.mcap", form, text)) as recording:
+    with open_recording(write_recording(tmp_path / "run.mcap", form, text)) as recording:
         assert recording.topics["/twist"].skipped is None
         leaves = ["level", "header.left", "header.right"]
         assert recording.leaves("/twist") == leaves
@@ -92,7 +92,7 @@ def test_definition_files_of_folder_are_parsed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a_msgs/Twist", "a_msgs/msg/Twist"])
 def test_type_name_is_the_same_with_or_without_msg(tmp_path: Path, name: str) -> None:
-    with open_recording(recorded(tmp_path / "run.mcap", "ros2msg", MSG, name)) as recording:
+    with open_recording(write_recording(tmp_path / "run.mcap", "ros2msg", MSG, name)) as recording:
         assert recording.topics["/twist"].type == "a_msgs/msg/Twist"
         assert recording.read({"/twist": ["level"]})["/twist"].fields["level"].tolist() == [7]
 
@@ -103,7 +103,7 @@ BUMP = "\n".join(f"bool {side}" for side in ("left_front", "left_side", "right_f
 LEVEL = "module a_msgs { module msg { struct Level { double value; }; }; };"
 
 
-def package(folder: Path) -> Path:
+def write_package(folder: Path) -> Path:
     (folder / "src" / "neato2_interfaces" / "msg").mkdir(parents=True)
     (folder / "src" / "neato2_interfaces" / "msg" / "Bump.msg").write_text(BUMP)
     (folder / "a_msgs").mkdir()
@@ -124,11 +124,11 @@ def test_folder_without_valid_definitions_is_rejected(text, message, tmp_path):
 def test_too_many_definition_files_are_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr("restock.ingest.decoding.definitions.MAX_FILES", 1)
     with pytest.raises(RecordingError, match="it holds 2 definitions, more than 1"):
-        folder_types(str(package(tmp_path)))
+        folder_types(str(write_package(tmp_path)))
 
 
 def test_definitions_can_be_distribution_folder_or_file(tmp_path):
-    folder = package(tmp_path)
+    folder = write_package(tmp_path)
     assert choose_definitions(None) == "humble"
     assert choose_definitions("jazzy") == "jazzy"
     assert choose_definitions(str(folder)) == f"humble+{folder}"
@@ -142,7 +142,7 @@ def test_definitions_can_be_distribution_folder_or_file(tmp_path):
 def test_unknown_type_is_read_with_given_definition(tmp_path, capsys):
     with open_recording(NEATO) as recording:
         assert "--definitions" in str(recording.topics["/bump"].skipped)
-    with open_recording(NEATO, definitions=str(package(tmp_path))) as recording:
+    with open_recording(NEATO, definitions=str(write_package(tmp_path))) as recording:
         bump = recording.topics["/bump"]
         assert (bump.skipped, bump.expected) == (None, 142)
     assert main(["info", str(NEATO), "--definitions", str(tmp_path / "none")]) != 0

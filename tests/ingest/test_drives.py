@@ -174,7 +174,7 @@ def test_drive_without_rows_is_not_used_as_base(tmp_path, shell):
     assert any(reported in item["text"] for item in proposal["advice"])
 
 
-def proposed(*recordings: Recording) -> Proposal:
+def propose(*recordings: Recording) -> Proposal:
     paths = [recording.path for recording in recordings]
     drives = drives_by_kind(paths, [robot_traits(recording) for recording in recordings])
     return propose_for_drives(recordings, drives, "amr")
@@ -187,11 +187,11 @@ def test_odometry_is_used_if_a_drive_has_no_map():
     with open_recording(sample) as mapped, open_recording(sample) as unmapped:
         for recording in (mapped, unmapped):
             del recording.topics["/amcl_pose"]
-        map_profile = parse_profile(proposed(mapped, mapped).toml, where="p")
+        map_profile = parse_profile(propose(mapped, mapped).toml, where="p")
         assert map_profile.frames is not None
         assert map_profile.frames.fixed == "map"
         del unmapped.topics["/tf"]
-        proposal = proposed(mapped, unmapped)
+        proposal = propose(mapped, unmapped)
         profile = parse_profile(proposal.toml, where="p")
         assert profile.frames is None
         assert profile.inputs.pose is not None

@@ -27,30 +27,30 @@ END = "end of the recording"
 FAR, NEAR = (0.0, 11.0, 1.0), (0.0, 3.0, 1.0)
 # goals as (time, x, y), task changes, expected episodes, ticks outside episodes
 ENDINGS = {
-    "the end of the recording": ([FAR], {}, [(0, 29, False, END, False)], {}),
+    "end of recording": ([FAR], {}, [(0, 29, False, END, False)], {}),
     # x = 1 + 0.5 t comes within 0.4 m of 3 at t = 3.2 s, tick 16.
-    "the goal": ([NEAR], {}, [(0, 16, True, "goal", False)], {"goal already reached": 13}),
+    "goal": ([NEAR], {}, [(0, 16, True, "goal", False)], {"goal already reached": 13}),
     # The mission layer sends the next goal at once, so the tick is judged by the previous goal.
-    "the goal, and the next one at once": (
+    "goal and next goal at once": (
         [NEAR, (3.2, 11.0, 1.0)],
         {},
         [(0, 16, True, "goal", True), (16, 29, False, END, False)],
         {},
     ),
     # The robot has passed the goal by 0.5 m at that time.
-    "the same goal again": (
+    "repeated goal": (
         [NEAR, (5.0, 3.0, 1.0)],
         {},
         [(0, 16, True, "goal", False), (25, 29, False, END, False)],
         {"goal already reached": 8},
     ),
-    "a new goal": (
+    "new goal": (
         [FAR, (2.0, 10.0, 1.0)],
         {},
         [(0, 10, False, "new goal", True), (10, 29, False, END, False)],
         {},
     ),
-    "the time limit": (
+    "time limit": (
         [FAR],
         {"time_limit_steps": 12},
         [

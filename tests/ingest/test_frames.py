@@ -58,7 +58,7 @@ def build_tree(frames: Frames, moving: list[Line], still: list[Line], **how: flo
     return Tree(frames, edges, segments)
 
 
-def at(*seconds: float) -> list[np.ndarray]:
+def stamps_at(*seconds: float) -> list[np.ndarray]:
     return [START_NS + np.rint(np.array(seconds) * 1e9).astype(np.int64)]
 
 
@@ -69,7 +69,7 @@ def test_chain_of_transforms_by_hand():
         [(0.0, "map", "odom", 10, 0, 0, np.pi / 2), (0.0, "odom", "base_link", 2, 1, 0, 0.0)],
         [(0.0, "base_link", "body", 0.5, 0, 0.2, 0.0)],
     )
-    found = tree.place("body", at(0.1))
+    found = tree.place("body", stamps_at(0.1))
     assert found.problem.tolist() == [""]
     assert found.translation_m[0] == pytest.approx([9.0, 2.5, 0.2])
     assert found.yaw_rad[0] == pytest.approx(np.pi / 2)
@@ -81,7 +81,7 @@ def test_inverse_transform_by_hand():
         (0.0, "odom", "map", 1, 2, 0, np.pi / 2),
         (0.0, "odom", "base", 1, 5, 0, 0),
     ]
-    found = build_tree(Frames(base="base"), lines, []).place("base", at(0.1))
+    found = build_tree(Frames(base="base"), lines, []).place("base", stamps_at(0.1))
     # 3 m along y of odom, from the map's origin, is 3 m along x of the map.
     assert found.translation_m[0] == pytest.approx([3.0, 0.0, 0.0])
     assert found.yaw_rad[0] == pytest.approx(-np.pi / 2)
@@ -104,7 +104,7 @@ def test_transforms_are_held_from_their_stamp():
     moving: list[Line] = [(0.0, "map", "odom", 0, 0, 0, 0)]
     moving += [(t, "odom", "base_link", t, 0, 0, 0) for t in (0.0, 0.1, 0.2, 0.3)]
     tree = build_tree(Frames(max_age_s=1.0), moving, [])
-    found = tree.place("base_link", at(-0.05, 0.0, 0.15, 0.29, 0.3, 1.0, 1.29, 1.31))
+    found = tree.place("base_link", stamps_at(-0.05, 0.0, 0.15, 0.29, 0.3, 1.0, 1.29, 1.31))
     assert found.translation_m[1:5, 0] == pytest.approx([0.0, 0.1, 0.2, 0.3])
     assert found.problem[0] == "no transform from map to base_link yet"
     assert found.problem[5] == ""  # map -> odom is one second old
@@ -129,7 +129,7 @@ def test_only_static_transforms_hold_across_clock_jump():
     assert report.jumps == 1
     tree = Tree(Frames(max_age_s=1e6), edges, segments)
     after = START_NS - 93 * NS
-    found = tree.place("base_link", [*at(2.0), np.array([after])])
+    found = tree.place("base_link", [*stamps_at(2.0), np.array([after])])
     assert found.problem.tolist() == ["", "no transform from map to odom yet"]
     assert found.translation_m[0, 0] == 8.0
 
@@ -138,7 +138,7 @@ def test_transform_with_future_stamp_counts_from_reception():
     """Localisation stamps map -> odom ahead, which must not affect the clock offset either."""
     moving: list[Line] = [(t, "map", "base_link", t, 0, 0, 0) for t in np.arange(0, 5, 0.5)]
     tree = build_tree(Frames(), moving, [], ahead_s=1.0)
-    found = tree.place("base_link", at(0.1, 1.01, 2.6))
+    found = tree.place("base_link", stamps_at(0.1, 1.01, 2.6))
     assert found.translation_m[:, 0].tolist() == [0.0, 1.0, 2.5]
     assert tree.segments[0].clock_map.offset_ns == 2_000_000
 
@@ -151,12 +151,15 @@ def test_frame_with_new_parent_is_followed():
     ]
     tree = build_tree(Frames(max_age_s=5), moving, [])
     assert tree.edges.parent_changes == 1
-    assert tree.place("base_link", at(0.5, 1.5)).translation_m[:, 0].tolist() == [6.0, 101.0]
+    assert tree.place("base_link", stamps_at(0.5, 1.5)).translation_m[:, 0].tolist() == [6.0, 101.0]
 
 
 def test_loop_of_frames_terminates():
     moving: list[Line] = [(0.0, "a", "base_link", 1, 0, 0, 0), (0.0, "base_link", "a", 1, 0, 0, 0)]
-    assert "no transform" in build_tree(Frames(), moving, []).place("base_link", at(0.1)).problem[0]
+    assert (
+        "no transform"
+        in build_tree(Frames(), moving, []).place("base_link", stamps_at(0.1)).problem[0]
+    )
 
 
 @settings(max_examples=40)
@@ -181,7 +184,7 @@ def test_zero_quaternion_is_reported_as_not_finite():
     segments, _ = align(
         {"/c": clock, **edges.topics}, Clock(), frozenset(), frozenset(edges.topics)
     )
-    found = Tree(Frames(), edges, segments).place("base_link", at(0.1))
+    found = Tree(Frames(), edges, segments).place("base_link", stamps_at(0.1))
     assert found.problem.tolist() == ["transform map -> base_link: not finite"]
 
 

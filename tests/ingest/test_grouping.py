@@ -38,7 +38,7 @@ def set_group_sizes(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
     patch.setattr(columns_module, "AHEAD_BYTES", size)
 
 
-def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
+def read_grouped(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         set_group_sizes(patch, size, rows)
         with open_recording(path, salvage=salvage) as recording:
@@ -51,7 +51,7 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
             }
 
 
-def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
+def write_shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
     """Write the same messages out of order, as the buffers of several recorders leave them."""
     with source.open("rb") as file, target.open("wb") as sink:
         messages = list(make_reader(file).iter_messages(log_time_order=False))
@@ -92,7 +92,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_mcap_grouping_does_not_change_columns(
     tmp_path_factory, sample, chunk_size, size, rows, seed, chunked, compression, index, kept_share
 ):
-    path = shuffled(
+    path = write_shuffled(
         sample,
         tmp_path_factory.mktemp("shuffled") / "run.mcap",
         chunk_size,
@@ -103,8 +103,8 @@ def test_mcap_grouping_does_not_change_columns(
     )
     if kept_share is not None:
         path.write_bytes(path.read_bytes()[: int(path.stat().st_size * kept_share)])
-    expected = read(path, WHOLE, 1, salvage=kept_share is not None)
-    regrouped = read(path, size, rows, salvage=kept_share is not None)
+    expected = read_grouped(path, WHOLE, 1, salvage=kept_share is not None)
+    regrouped = read_grouped(path, size, rows, salvage=kept_share is not None)
     assert_same_columns(expected.pop("columns"), regrouped.pop("columns"))
     assert expected == regrouped
 
@@ -112,9 +112,9 @@ def test_mcap_grouping_does_not_change_columns(
 @pytest.mark.parametrize("size", [1, 3000, 40_000])
 def test_sqlite_batch_size_does_not_change_columns(size: int, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run", count=60)
-    expected = read(bag, WHOLE, 1, salvage=False)
+    expected = read_grouped(bag, WHOLE, 1, salvage=False)
     for salvage in (False, True):
-        regrouped = read(bag, size, 7, salvage=salvage)
+        regrouped = read_grouped(bag, size, 7, salvage=salvage)
         assert_same_columns(expected["columns"], regrouped["columns"])
         assert expected["accounts"] == regrouped["accounts"]
 

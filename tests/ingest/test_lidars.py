@@ -58,7 +58,7 @@ class CorridorDrive(Drive):
     ) -> TopicColumns:
         step = self.field_rad / BEAMS
         bearing = np.arange(BEAMS) * step - self.field_rad / 2  # in the lidar's frame
-        ranges = np.stack([cast(self.x_at(time) - 1.0, place, bearing) for time in times_s])
+        ranges = np.stack([cast_rays(self.x_at(time) - 1.0, place, bearing) for time in times_s])
         fields = scans(ranges)
         sign = -1 if upside_down else 1
         fields["angle_min"] = np.full(len(times_s), sign * bearing[0])
@@ -73,7 +73,7 @@ class CorridorDrive(Drive):
         return write_bag(self, folder, storage="mcap")
 
 
-def cast(moved_m: float, place: Place, bearing: Any) -> Any:
+def cast_rays(moved_m: float, place: Place, bearing: Any) -> Any:
     """Return ranges (B,) to the walls, a post beside the path and a post behind its start."""
     x, y = 1.0 + moved_m + place[0], 1.0 + place[1]
     way = np.stack([np.cos(bearing + place[2]), np.sin(bearing + place[2])])

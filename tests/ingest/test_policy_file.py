@@ -94,7 +94,7 @@ def add_third_dimension(model: Any) -> None:
 
 HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
     "loop": (add_loop, "has the operator Loop"),
-    "24 GB": (
+    "24 GB constant": (
         insert(node("ConstantOfShape", ["size"], ["much"]), size=np.array([6 * 10**9])),
         "has the operator ConstantOfShape",
     ),
@@ -106,7 +106,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
         ),
         "computes (80000, 80000)",
     ),
-    "rows by rows": (
+    "N x N by broadcasting": (
         insert(
             node("ReduceMax", ["observation", "axes"], ["a"], keepdims=0),
             node("ReduceMax", ["observation", "axes"], ["b"]),
@@ -115,7 +115,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
         ),
         "computes (N, N)",
     ),
-    "all axes": (
+    "reduction of all axes": (
         insert(node("ReduceMax", ["observation"], ["a"])),
         "does not fit: ReduceMax of (N, ",
     ),
@@ -146,14 +146,14 @@ HOSTILE: dict[str, tuple[Callable[[Any], object], str]] = {
         insert(**{f"c{i}": np.zeros((), np.float32) for i in range(MAX_PARTS)}),
         f"more than {MAX_PARTS}",
     ),
-    "a cycle": (insert(node("Relu", ["values"], ["a"])), "reads 'values' before"),
-    "twice": (insert(node("Relu", ["observation"], ["values"])), "has 'values' twice"),
-    "an output of nothing": (
+    "cycle": (insert(node("Relu", ["values"], ["a"])), "reads 'values' before"),
+    "duplicate name": (insert(node("Relu", ["observation"], ["values"])), "has 'values' twice"),
+    "undefined output": (
         lambda m: m.graph.output.append(onnx.helper.make_tensor_value_info("more", 1, ["N"])),
         "returns 'more'",
     ),
     "two inputs": (lambda m: m.graph.input.append(m.graph.input[0]), "takes 2 inputs"),
-    "another width": (
+    "another input width": (
         lambda m: setattr(m.graph.input[0].type.tensor_type.shape.dim[1], "dim_value", 99),
         "does not fit: Gemm of (N, 99)",
     ),

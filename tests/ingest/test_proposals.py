@@ -58,7 +58,7 @@ def profile_json(*arguments: object) -> tuple[int, Any]:
     return code, json.loads(out.getvalue())
 
 
-def proposed(recording: Path, *options: str, code: int = 0) -> tuple[Any, Profile, Path]:
+def propose(recording: Path, *options: str, code: int = 0) -> tuple[Any, Profile, Path]:
     """Return the document of a proposal, the profile, and its file beside the recording."""
     exit_code, document = profile_json("new", recording, *options)
     assert exit_code == code, document
@@ -76,7 +76,7 @@ def check_outcome(profile: Path, recording: Path) -> Any:
 # -- robots ----------------------------------------------------------------------------------
 
 
-def usual(seconds: float = 6.0, **changes: Any) -> Topics:
+def plain_topics(seconds: float = 6.0, **changes: Any) -> Topics:
     """Return the topics of a plain drive, without those in `drop` and with those in `add`."""
     drop, add = changes.pop("drop", ()), changes.pop("add", {})
     topics = typed_topics(Drive(seconds, **changes))
@@ -175,19 +175,21 @@ def with_speed_command(ahead_mps: float, aside_mps: float = 0.0, seconds: float 
     count = len(ticks := np.arange(0, seconds, 0.2))
     speeds = {"linear.x": ahead_mps, "linear.y": aside_mps, "angular.z": 0.0}
     fields = {path: np.full(count, speed) for path, speed in speeds.items()}
-    return usual(seconds, add={"/cmd_vel": (TWIST, columns(ticks + 0.005, fields, stamped=False))})
+    return plain_topics(
+        seconds, add={"/cmd_vel": (TWIST, columns(ticks + 0.005, fields, stamped=False))}
+    )
 
 
 def local_plan(topic: str, **changes: Any) -> Topics:
     """Return a drive with a controller's local plan, more frequent than the global plan."""
     path = {f"poses[].pose.position.{axis}": ragged([np.full(60, 1.0)] * 2) for axis in "xy"}
     near = columns(np.arange(0.0, 6.0, 0.1), path)
-    return usual(**changes, add={topic: ("nav_msgs/msg/Path", near)})
+    return plain_topics(**changes, add={topic: ("nav_msgs/msg/Path", near)})
 
 
 def with_move_base_goals() -> Topics:
     """Return a drive with goals whose frame is in their pose, as the action header has none."""
-    topics = usual()
+    topics = plain_topics()
     _, sent = topics.pop("/goal_pose")
     position = "goal.target_pose.pose.position"
     fields = {path.replace("pose.position", position): c for path, c in sent.fields.items()}
@@ -197,7 +199,7 @@ def with_move_base_goals() -> Topics:
 
 
 def without_gyro() -> Topics:
-    topics = usual()
+    topics = plain_topics()
     unknown = np.zeros((len(topics["/imu"][1]), 9))
     unknown[:, 0] = -1
     topics["/imu"][1].fields["angular_velocity_covariance"] = unknown
@@ -205,13 +207,13 @@ def without_gyro() -> Topics:
 
 
 def two_lidars() -> Topics:
-    topics = usual()
+    topics = plain_topics()
     topics["/scan_front"] = topics["/scan_back"] = topics.pop("/scan")
     return topics
 
 
 def with_laser(frame: str = "laser", **tf: tuple[str, TopicColumns]) -> Topics:
-    topics = usual()
+    topics = plain_topics()
     scan = topics["/scan"][1]
     scan.fields["header.frame_id"] = np.full(len(scan), frame, object)
     for limit, value in (("range_min", 0.05), ("range_max", 8.0)):
@@ -240,11 +242,11 @@ def topics_of(*names: str) -> Callable[[Profile], Any]:
 ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], Any, list[str]]] = {
     # Topics and their roles.
     "navigation": (
-        usual(proposals="/mux/input/navi"), (), topics_of("command", "nav_command"),
+        plain_topics(proposals="/mux/input/navi"), (), topics_of("command", "nav_command"),
         ("/cmd_vel", "/mux/input/navi"), ["beside the command that is driven (/cmd_vel)"],
     ),
     "joystick": (
-        usual(proposals="/joy/cmd_vel"), (), topics_of("command", "nav_command"),
+        plain_topics(proposals="/joy/cmd_vel"), (), topics_of("command", "nav_command"),
         ("/cmd_vel", None), [],
     ),
     "local plan beside plan": (
@@ -259,14 +261,14 @@ ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], A
     ),
     "two lidars": (two_lidars(), (), topics_of("scan"), ("/scan_front",), ["or /scan_back?"]),
     "bumper": (
-        usual(), (), lambda p: p.task.bump_terminates, True, ["- no bumper seen"],
+        plain_topics(), (), lambda p: p.task.bump_terminates, True, ["- no bumper seen"],
     ),
     "no bumper": (
-        usual(drop=("/bumper",)), (), lambda p: p.task.bump_terminates, True,
+        plain_topics(drop=("/bumper",)), (), lambda p: p.task.bump_terminates, True,
         ["no bumper seen"],
     ),
     "no commands": (
-        usual(drop=("/cmd_vel", "/scan")), ODOMETRY, topics_of("command"), ("/odom",),
+        plain_topics(drop=("/cmd_vel", "/scan")), ODOMETRY, topics_of("command"), ("/odom",),
         ["no command was recorded: the measured motion is used"],
     ),
     "IMU without gyro": (
@@ -350,7 +352,7 @@ ROBOTS: dict[str, tuple[Topics | Drive, tuple[str, ...], Callable[[Any], Any], A
 def test_proposal_fits_its_robot(name, tmp_path):
     robot, options, property_of, expected, texts = ROBOTS[name]
     topics = typed_topics(robot) if isinstance(robot, Drive) else robot
-    document, profile, file = proposed(write_topics(topics, tmp_path / "bag"), *options)
+    document, profile, file = propose(write_topics(topics, tmp_path / "bag"), *options)
     assert document["problems"] == []
     assert property_of(profile) == expected
     text = " ".join(file.read_text().replace("\n# ", " ").split(" "))
@@ -369,7 +371,7 @@ def test_unusual_commands_give_advice(tmp_path):
         ("aside", with_speed_command(0.4, 0.3)),
         ("never", with_speed_command(0.0)),
     ):
-        document, _, _ = proposed(write_topics(topics, tmp_path / name))
+        document, _, _ = propose(write_topics(topics, tmp_path / name))
         advice[name] = {item["key"]: item["text"] for item in document["advice"]}
     assert "contain a sideways speed, up to 0.3 m/s" in advice["aside"]["inputs.command"]
     assert "the actions are a guess" in advice["never"]["task.actions"]
@@ -377,7 +379,7 @@ def test_unusual_commands_give_advice(tmp_path):
 
 
 def test_proposal_without_commands_is_unusable(tmp_path):
-    bag = write_topics(usual(drop=("/cmd_vel", "/scan")), tmp_path / "bag")
+    bag = write_topics(plain_topics(drop=("/cmd_vel", "/scan")), tmp_path / "bag")
     code, document = profile_json("new", bag)
     assert (code, document["missing"]) == (3, ["command"])
     (tmp_path / "p.toml").write_text(document["toml"])
@@ -387,7 +389,7 @@ def test_proposal_without_commands_is_unusable(tmp_path):
 def test_command_hold_follows_observed_motion(tmp_path):
     times = (*np.arange(0, 1, 0.1), 6.0, 17.0)
     bag = write_bag(CommandedDrive(20.0, times_s=times), tmp_path / "bag")
-    document, profile, file = proposed(bag)
+    document, profile, file = propose(bag)
     assert (profile.clock.steps, profile.inputs.command.max_age_s) == ("rate", pytest.approx(11))
     assert document["transitions"] > 90  # 20 s at 5 Hz
     strict = file.read_text().replace("max_age_s = 11", "max_age_s = 1", 1)
@@ -404,14 +406,14 @@ def test_command_hold_follows_observed_motion(tmp_path):
 
 def test_outline_contradicted_by_lidar_gives_advice(tmp_path):
     bag = write_bag(CommandedDrive(10.0, nearest_m=0.28), tmp_path / "bag")
-    document, _, file = proposed(bag)
+    document, _, file = propose(bag)
     texts = [item["text"] for item in document["advice"] if item["key"] == "task.body"]
     assert any("inside the robot at 100%" in text for text in texts)
     assert any(
         "`task.body`: with an outline of 0.6" in advice
         for advice in profile_json("check", file, bag)[1]["advice"]
     )
-    assert proposed(bag, "--footprint", "0.1x0.1")[0]["advice"] == []
+    assert propose(bag, "--footprint", "0.1x0.1")[0]["advice"] == []
 
 
 def test_ingest_notes_lidar_without_transform(tmp_path):
@@ -438,7 +440,7 @@ def test_ingest_notes_lidar_without_transform(tmp_path):
 
 def test_utm_poses_are_stored_to_the_millimetre(tmp_path):
     recording, store = write_bag(UtmDrive(8.0), tmp_path / "bag"), tmp_path / "store"
-    _, profile, file = proposed(recording)
+    _, profile, file = propose(recording)
     query = "SELECT pose_x_m, pose_y_m FROM transitions ORDER BY stamp_ns"
     with ingested(recording, file, store) as rows:
         found = rows.sql(query).fetchnumpy()
@@ -455,17 +457,17 @@ def test_utm_poses_are_stored_to_the_millimetre(tmp_path):
 # -- evidence behind the choices ------------------------------------------------------------------
 
 
-def reported(speeds: Any, turns: Any = 0.0) -> Commands:
+def fastest_commands(speeds: Any, turns: Any = 0.0) -> Commands:
     speeds = np.asarray(speeds, np.float64)
     return Commands().fastest(speeds, np.broadcast_to(turns, speeds.shape))
 
 
 def test_reverse_actions_of_a_car_follow_its_logs():
     car = RobotProposal(values={"drive": "ackermann", "wheelbase_m": 0.4, "max_steering_rad": 0.5})
-    backs = reverse_actions(actions_of(reported([*[1.0] * 50, *[-0.8] * 50], 0.5), car))
+    backs = reverse_actions(actions_of(fastest_commands([*[1.0] * 50, *[-0.8] * 50], 0.5), car))
     assert {speed for speed, _ in backs} == {-0.8}
     assert sorted(np.sign(turn) for _, turn in backs) == [-1, 0, 1]
-    assert reverse_actions(actions_of(reported([1.0, 0.5], 0.5), car)) == []
+    assert reverse_actions(actions_of(fastest_commands([1.0, 0.5], 0.5), car)) == []
 
 
 def test_proposed_control_period_suits_the_twin() -> None:
@@ -528,7 +530,7 @@ def test_pose_from_transforms_without_pose_topic(tmp_path):
 
 
 def test_proposal_for_bag_of_arbitrary_types(tmp_path):
-    document, _, _ = proposed(write_sample_bag(tmp_path / "bag"), *ODOMETRY)
+    document, _, _ = propose(write_sample_bag(tmp_path / "bag"), *ODOMETRY)
     assert document["missing"] == document["problems"] == []
     assert document["signals"] == len(re.findall(r"^# \[signals\.", document["toml"], re.M)) > 4
     parse_profile(with_all_signals(document["toml"]), where="p")

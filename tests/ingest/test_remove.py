@@ -51,7 +51,7 @@ def make_files_old(place: Path) -> None:
         os.utime(file, (0, 0))
 
 
-@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "joined files"])
+@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "compacted files"])
 @pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
 def test_removed_recording_stays_in_earlier_version(place, compacted):
     writer = store_of_three(place, compacted=compacted)
@@ -88,7 +88,7 @@ def test_files_are_deleted_after_retention(tmp_path):
     assert shown(tmp_path / "s") == expected((1, "a"), (3, "a"))
 
 
-@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "joined files"])
+@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "compacted files"])
 def test_all_recordings_of_an_old_store_can_be_removed(tmp_path, compacted, monkeypatch):
     """The manifests' file is old by then and belongs to no remaining recording."""
     place = tmp_path / "s"
@@ -149,7 +149,7 @@ def test_recording_is_found_by_id_prefix_or_path(tmp_path, monkeypatch):
     assert len(shown(tmp_path / "s")) == 3
 
 
-@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "joined files"])
+@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "compacted files"])
 def test_removal_succeeds_after_concurrent_write(tmp_path, before_commit, compacted):
     writer = store_of_three(tmp_path / "s", compacted=compacted)
     before_commit(lambda: StoreWriter(tmp_path / "s").write_all([one(1, "b"), one(4)]))
@@ -157,7 +157,7 @@ def test_removal_succeeds_after_concurrent_write(tmp_path, before_commit, compac
     assert shown(tmp_path / "s") == expected((1, "b"), (3, "a"), (4, "a"))
 
 
-@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "joined files"])
+@pytest.mark.parametrize("compacted", [False, True], ids=["own files", "compacted files"])
 def test_concurrently_reingested_recording_is_not_removed(tmp_path, before_commit, compacted):
     writer = store_of_three(tmp_path / "s", compacted=compacted)
     before_commit(lambda: StoreWriter(tmp_path / "s").write(*one(2, "b")))

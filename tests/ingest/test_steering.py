@@ -30,7 +30,7 @@ ROBOTS = {
 }
 
 
-def commands(seed: int, *, spot: bool) -> Any:
+def remote_commands(seed: int, *, spot: bool) -> Any:
     """Return remote-control commands (T, 2), each held for 0.6 to 3 s; `spot` adds pivots."""
     rng, held = np.random.default_rng(seed), []
     if spot:
@@ -43,7 +43,7 @@ def commands(seed: int, *, spot: bool) -> Any:
 def evidence_of(name: str, seed: int, *, spot: bool) -> DriveEvidence:
     """Return the evidence in such a drive of the twin's robot, with localiser poses."""
     robot, body = ROBOTS[name]
-    reported = commands(seed, spot=spot)
+    reported = remote_commands(seed, spot=spot)
     still = (
         *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
         *("localised_speed_mps", "localised_lateral_mps"),

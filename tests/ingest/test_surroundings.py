@@ -256,7 +256,9 @@ SECTOR_MAP = SectorMap.build(BEARINGS, TASK.sectors, TASK.body)
 PERIOD_S = 0.2
 
 
-def scan(pose: tuple[float, float, float], discs: list[Disc], walls_m: float = 6.0) -> Any:
+def room_clearance(
+    pose: tuple[float, float, float], discs: list[Disc], walls_m: float = 6.0
+) -> Any:
     """Return sector clearances (1, K) in a room."""
     ranges = ranges_in_room(BEARINGS, pose, discs, walls_m)
     return SECTOR_MAP.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
@@ -277,8 +279,8 @@ def approach_m(
 ) -> float:
     """Return the approach measured while the robot drove an arc and objects moved to `then`."""
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
-    before = signals(0, scan((0.0, 0.0, 0.0), discs), forward_m, turn)
-    now = signals(1, scan(pose, moved), forward_m, turn)
+    before = signals(0, room_clearance((0.0, 0.0, 0.0), discs), forward_m, turn)
+    now = signals(1, room_clearance(pose, moved), forward_m, turn)
     return float(came_nearer(TASK, now, [before])[0])
 
 
@@ -307,8 +309,8 @@ def test_standing_objects_do_not_approach(discs, forward_m, turn, walls):
     """Sector width leaves an error below the approach of a person at 0.5 m/s."""
     discs = [disc for disc in discs if np.hypot(disc[0], disc[1]) > disc[2] + 0.5]
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
-    before = signals(0, scan((0.0, 0.0, 0.0), discs, walls), forward_m, turn)
-    now = signals(1, scan(pose, discs, walls), forward_m, turn)
+    before = signals(0, room_clearance((0.0, 0.0, 0.0), discs, walls), forward_m, turn)
+    now = signals(1, room_clearance(pose, discs, walls), forward_m, turn)
     assert came_nearer(TASK, now, [before])[0] < 0.1
 
 
@@ -320,25 +322,32 @@ def last_approach_m(scans: list[Any]) -> float:
 
 def test_flickering_edge_does_not_approach():
     """Chair legs and edges flicker against the background."""
-    visible, missed = (scan((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], []))
+    visible, missed = (
+        room_clearance((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], [])
+    )
     assert last_approach_m([missed, visible]) > 0.2  # two scans alone look like an approach
     assert last_approach_m([visible, missed, visible]) == 0
     assert last_approach_m([visible, missed, missed, missed, visible]) == 0
 
 
 def test_steady_approach_is_measured_against_all_scans():
-    at = [scan((0.0, 0.0, 0.0), [(far, 0.0, 0.25)], 3.0) for far in (2.0, 1.8, 1.6, 1.4, 1.2)]
+    at = [
+        room_clearance((0.0, 0.0, 0.0), [(far, 0.0, 0.25)], 3.0)
+        for far in (2.0, 1.8, 1.6, 1.4, 1.2)
+    ]
     assert last_approach_m(at) == pytest.approx(0.2, abs=0.06)
 
 
 def test_sudden_large_approach_is_ignored():
     """The object was behind a corner or in a lost beam: nobody walks a metre in one step."""
-    empty, near = (scan((0.0, 0.0, 0.0), discs, 2.5) for discs in ([], [(1.2, 0.0, 0.25)]))
+    empty, near = (
+        room_clearance((0.0, 0.0, 0.0), discs, 2.5) for discs in ([], [(1.2, 0.0, 0.25)])
+    )
     assert last_approach_m([empty, empty, near]) == 0
 
 
 def test_sector_without_return_gives_no_approach():
-    near = scan((0.0, 0.0, 0.0), [(1.9, 0.0, 0.25)], 3.0)
+    near = room_clearance((0.0, 0.0, 0.0), [(1.9, 0.0, 0.25)], 3.0)
     lost = np.full_like(near, TASK.range_max_m)
     assert last_approach_m([lost, near]) == 0
 
@@ -346,7 +355,7 @@ def test_sector_without_return_gives_no_approach():
 def test_held_scans_give_no_approach():
     """Held scans show the surroundings of the robot's position some steps earlier."""
     at_m = np.arange(8) * 0.15
-    scans = [scan((x, 0.0, 0.0), [(3.0, 0.2, 0.4)]) for x in at_m]
+    scans = [room_clearance((x, 0.0, 0.0), [(3.0, 0.2, 0.4)]) for x in at_m]
     held = [signals(step, scans[step - step % 2], 0.15, 0.0) for step in range(8)]
     for step in range(2, 8):
         assert came_nearer(TASK, held[step], held[:step][::-1])[0] < 0.02
@@ -359,7 +368,7 @@ def test_return_on_plan_is_found():
     plan = np.where(at_m <= TASK.near_m, at_m * near, near + beyond * (far - near))[None]
 
     def distance_and_gap(discs: list[Disc]) -> tuple[float, float]:
-        distance_m, gap_m = returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)
+        distance_m, gap_m = returns_on_plan(TASK, room_clearance((0.0, 0.0, 0.0), discs), plan)
         return float(distance_m[0]), float(gap_m[0])
 
     def distance(discs: list[Disc]) -> float:
@@ -371,7 +380,7 @@ def test_return_on_plan_is_found():
     assert distance([(2.0, -0.3, 0.2)]) == TASK.range_max_m  # straight ahead, off the plan
     assert distance([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside the plan
     free = msgspec.structs.replace(TASK, goal="none")
-    ahead = scan((0.0, 0.0, 0.0), [(1.0, 0.0, 0.2)])
+    ahead = room_clearance((0.0, 0.0, 0.0), [(1.0, 0.0, 0.2)])
     assert [values[0] for values in returns_on_plan(free, ahead, plan)] == [TASK.range_max_m] * 2
 
 
@@ -379,7 +388,7 @@ def test_gap_is_to_nearest_return_beside_plan():
     plan = np.stack([np.array(plan_distances_m(TASK)), np.zeros(7)], axis=-1)[None]
 
     def gap(discs: list[Disc]) -> float:
-        return float(returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)[1][0])
+        return float(returns_on_plan(TASK, room_clearance((0.0, 0.0, 0.0), discs), plan)[1][0])
 
     assert gap([]) == TASK.range_max_m
     assert gap([(0.9, 0.0, 0.2)]) == pytest.approx(0.0, abs=0.1)

@@ -41,7 +41,7 @@ unit = "V"
 """
 
 
-def ingested(folder: Path, more: str) -> Store:
+def open_ingested(folder: Path, more: str) -> Store:
     """Ingest a shipped recording with the shipped profile plus `more`, and open the store."""
     (folder / "own.toml").write_text(WAREHOUSE + more)
     tuesday, profile = ROOT / "sample_logs" / "amr_tuesday", folder / "own.toml"
@@ -52,13 +52,13 @@ def ingested(folder: Path, more: str) -> Store:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
-    with ingested(tmp_path_factory.mktemp("plain"), "") as store:
+    with open_ingested(tmp_path_factory.mktemp("plain"), "") as store:
         return store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
 
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
-    with ingested(tmp_path_factory.mktemp("own"), TERMS + ENTRIES) as store:
+    with open_ingested(tmp_path_factory.mktemp("own"), TERMS + ENTRIES) as store:
         return store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
 
 
@@ -108,7 +108,7 @@ def test_own_entries_are_appended_to_observation(plain, rows):
 
 
 def test_reward_term_on_custom_signal_works_only_on_logs(plain, tmp_path):
-    with ingested(tmp_path, BATTERY) as store:
+    with open_ingested(tmp_path, BATTERY) as store:
         rows = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     added = (rows["reward"].to_numpy() - plain["reward"].to_numpy()).round(5)
     assert set(added.tolist()) == {0.0, -1.0}
@@ -209,7 +209,7 @@ def test_own_entries_cannot_be_mirrored():
         Mirror.of(own)
 
 
-def without(text: str, *inputs: str) -> str:
+def remove_inputs(text: str, *inputs: str) -> str:
     return re.sub(rf"(?ms)^\[inputs\.({'|'.join(inputs)})\].*?(?=^\[)", "", text)
 
 
@@ -219,8 +219,8 @@ HINDSIGHT = WAREHOUSE.replace("[clock]", '[goal]\nsource = "hindsight"\n\n[clock
 @pytest.mark.parametrize(
     ("text", "sql", "message"),
     [
-        (without(WAREHOUSE, "scan"), "coalesce(clearance_m, 9)", "there is no lidar"),
-        (without(HINDSIGHT, "goal", "plan"), "plan_gap_m", "the path that was driven"),
+        (remove_inputs(WAREHOUSE, "scan"), "coalesce(clearance_m, 9)", "there is no lidar"),
+        (remove_inputs(HINDSIGHT, "goal", "plan"), "plan_gap_m", "the path that was driven"),
     ],
 )
 def test_reward_term_on_unknown_signal_is_rejected(text, sql, message):

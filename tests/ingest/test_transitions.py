@@ -25,7 +25,7 @@ def rows_of(topics: dict[str, TopicColumns], profile: Profile = PROFILE) -> pa.T
     return transitions(profile, steps, episodes, rows, PROVENANCE)
 
 
-def vectors(table: pa.Table, name: str) -> np.ndarray:
+def vector_column(table: pa.Table, name: str) -> np.ndarray:
     column = table[name].combine_chunks()
     return column.flatten().to_numpy().reshape(len(table), -1)
 
@@ -42,7 +42,7 @@ def test_rows_have_the_store_schema():
 def test_next_observation_equals_that_of_next_row():
     drive = Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)])
     table = rows_of(drive.topics())
-    before, after = vectors(table, "observation"), vectors(table, "next_observation")
+    before, after = vector_column(table, "observation"), vector_column(table, "next_observation")
     same = np.array(table["episode_index"])[1:] == np.array(table["episode_index"])[:-1]
     assert same.sum() == 27
     assert np.array_equal(after[:-1][same], before[1:][same])
@@ -119,7 +119,7 @@ def test_progress_without_goal_is_forward_displacement():
     del topics["/goal_pose"], topics["/plan"]
     table = rows_of(topics, profile)
     assert table["progress_m"].to_numpy() == pytest.approx(np.full(29, 0.1), abs=1e-5)
-    assert not vectors(table, "observation")[:, :5].any()
+    assert not vector_column(table, "observation")[:, :5].any()
     assert not np.array(table["terminated"]).any()
 
 
@@ -139,7 +139,7 @@ def test_observations_are_finite_for_any_sensor_values(goal):
     table = rows_of(topics, profile)
     assert len(table) > 0
     for name in ("observation", "next_observation"):
-        assert np.isfinite(vectors(table, name)).all()
+        assert np.isfinite(vector_column(table, name)).all()
     for name in ("reward", "progress_m", "localised_speed_mps"):
         assert np.isfinite(table[name].to_numpy()).all()
 
@@ -151,7 +151,7 @@ def test_previous_action_is_kept_across_time_limit():
     )
     table = rows_of(Drive().topics(), profile)
     names = TASK.observation_names
-    observation = vectors(table, "observation")
+    observation = vector_column(table, "observation")
     assert observation[0, names.index("previous_action_0")] == 1
     assert table["step_index"][10].as_py() == 0
     assert observation[10, names.index("previous_action_1")] == 1
