@@ -1,6 +1,6 @@
-"""A profile of one's own goes with its rows: store, panel and run carry its text.
+"""Check custom profiles, whose text the store, the panel and the run carry.
 
-Its conditions over custom signals label logs, not the twin, which has no such signals.
+Conditions over custom signals label logs, not the twin, which has no such signals.
 """
 
 import json

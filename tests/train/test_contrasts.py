@@ -136,8 +136,8 @@ def test_study_page_lists_contrasts_and_safety(tmp_path: Path) -> None:
         add_evaluation(job.path, evaluation_episodes("agent", level, 12.0))
         job.done.write_text(plan.fingerprint(job))
     add_evaluation(plan.jobs[0].path, evaluation_episodes("planner", 0.5, 10.0))
-    one, other = plan.study.arms
-    found = findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
+    uniform, quotas = plan.study.arms
+    found = findings(plan, [compare(plan.runs(uniform), plan.runs(quotas), treatment="mixture")])
     primary = found["contrasts"][0]
     assert (primary["measure"], primary["difference"]) == ("success_rare", pytest.approx(0.55))
     rows = {row["arm"]: row for row in found["arms"]}

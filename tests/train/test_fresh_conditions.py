@@ -115,22 +115,24 @@ def test_labels_reach_rows_in_any_order(data: st.DataObject) -> None:
     known = data.draw(st.sets(st.sampled_from(sorted(lengths)))) if lengths else set()
     lost = data.draw(st.sets(st.integers(31, 35)))
     labels = EpisodeLabels()
-    for of in known:
-        codes = (np.arange(lengths[of]) + of) % 5
-        labels.note(of, codes, codes - 1)
-    for of in sorted(lost):
-        labels.give_up(of)
+    for episode in known:
+        codes = (np.arange(lengths[episode]) + episode) % 5
+        labels.note(episode, codes, codes - 1)
+    for episode in sorted(lost):
+        labels.give_up(episode)
     steps = [(key, step) for key, length in lengths.items() for step in range(length)]
     drawn = data.draw(st.lists(st.sampled_from(steps))) if steps else []
-    drawn += [(of, 0) for of in sorted(lost)]
+    drawn += [(episode, 0) for episode in sorted(lost)]
     condition = np.full(len(drawn), WAITING, np.int16)
     stratum = condition.copy()
     key = np.array([one for one, _ in drawn], np.int64)
     step = np.array([one for _, one in drawn], np.int32)
     labels.fill(condition, stratum, key, step)
-    for code, in_stratum, (of, at) in zip(condition.tolist(), stratum.tolist(), drawn, strict=True):
-        if of in known:
-            assert code == (at + of) % 5
+    for code, in_stratum, (episode, at) in zip(
+        condition.tolist(), stratum.tolist(), drawn, strict=True
+    ):
+        if episode in known:
+            assert code == (at + episode) % 5
             assert in_stratum == code - 1
         else:
-            assert code == (NEVER if of in lost else WAITING)
+            assert code == (NEVER if episode in lost else WAITING)

@@ -52,21 +52,22 @@ def test_compiled_rows_match_numpy(seed, sizes, cleared_after):
     ring = ring_of(rng)
     both = [(SampledRows(LOGGED), SampledRows(FRESH)) for _ in range(2)]
     for place, (logged, fresh, weighted) in enumerate(sizes):
-        one = batch(rng, logged, fresh, weighted)
+        sampled = batch(rng, logged, fresh, weighted)
         for sources, by_native in zip(both, (True, False), strict=True):
             to = {"ring": ring, "logged": sources[0], "fresh": sources[1], "by_native": by_native}
-            keep_rows(**one, **to)
+            keep_rows(**sampled, **to)
             if place == cleared_after:
                 taken = [(rows, dict(rows.columns)) for rows in sources]
                 before = [
-                    {name: of.copy() for name, of in reported.items()} for _, reported in taken
+                    {name: column_values.copy() for name, column_values in reported.items()}
+                    for _, reported in taken
                 ]
                 for rows, _ in taken:
                     rows.clear()
-                keep_rows(**one, **to)
+                keep_rows(**sampled, **to)
                 for (_, reported), held in zip(taken, before, strict=True):
-                    for name, of in held.items():
-                        assert np.array_equal(reported[name], of)
+                    for name, column_values in held.items():
+                        assert np.array_equal(reported[name], column_values)
     for of_compiled, of_numpy in zip(*both, strict=True):
         assert len(of_compiled) == len(of_numpy)
         for name, column in of_compiled.columns.items():

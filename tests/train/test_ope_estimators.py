@@ -196,5 +196,5 @@ def test_cloning_recovers_behaviour_policy() -> None:
     np.testing.assert_allclose(chance, BEHAVIOUR[:-1], atol=0.05)
 
 
-def _estimates(of: OpeEpisodes, *, resamples: int = 200):
-    return estimate(of, rng=np.random.default_rng(0), resamples=resamples)
+def _estimates(episodes: OpeEpisodes, *, resamples: int = 200):
+    return estimate(episodes, rng=np.random.default_rng(0), resamples=resamples)

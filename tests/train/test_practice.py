@@ -36,8 +36,8 @@ ARMS = [
 def ended_episodes(
     kind: str, success: bool, count: int = 1, block: str = "none"
 ) -> list[EndedEpisode]:
-    one = EndedEpisode(*(0, 0, 0, 0, 0, "nominal", kind, block, 0.0, success, 0, 1), signals={})
-    return [one] * count
+    episode = EndedEpisode(*(0, 0, 0, 0, 0, "nominal", kind, block, 0.0, success, 0, 1), signals={})
+    return [episode] * count
 
 
 def practice(rule: str) -> Practice:
@@ -136,9 +136,9 @@ def test_resume_with_other_arms_is_rejected(tmp_path: Path) -> None:
     first = session(tmp_path / "run", config(practice=PRACTICE))
     first.save()
     first.close()
-    one = {"conditions": {"nominal": 1.0, "wheel_slip": 0.0}}
+    nominal_only = {"conditions": {"nominal": 1.0, "wheel_slip": 0.0}}
     with pytest.raises(RunError, match="practised nominal, wheel_slip; now there are nominal"):
-        session(tmp_path / "run", config(practice=PRACTICE, env=one), resume=True)
+        session(tmp_path / "run", config(practice=PRACTICE, env=nominal_only), resume=True)
 
 
 def test_warehouse_draws_missions_of_the_requested_arms() -> None:

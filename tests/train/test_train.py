@@ -216,10 +216,10 @@ def test_killed_run_resumes_bit_exactly(tmp_path: Path, rows: int) -> None:
         assert torch.equal(value, killed["learner"]["network"][name]), name
     np.testing.assert_equal(whole["ring"], killed["ring"])
     for name in ("strata", "audit", "evaluations", "episodes", "evaluation_buffer"):
-        one, two = (
+        whole_table, killed_table = (
             pq.read_table(tmp_path / run / f"{name}.parquet") for run in ("whole", "killed")
         )
-        assert one.equals(two), name
+        assert whole_table.equals(killed_table), name
 
 
 @pytest.mark.parametrize(

@@ -51,11 +51,11 @@ def test_table_command_equals_its_index() -> None:
     table = np.array(discrete.task.actions)
     rng = np.random.default_rng(0)
     for action in rng.integers(len(table), size=(30, 4)):
-        one = discrete.step(action)
-        other = continuous.step(table[action])
-        np.testing.assert_array_equal(other[4]["action"], action)
-        np.testing.assert_allclose(other[4]["action_residual"], 0, atol=1e-6)
-        for left, right in zip(one[:4], other[:4], strict=True):
+        by_index = discrete.step(action)
+        by_command = continuous.step(table[action])
+        np.testing.assert_array_equal(by_command[4]["action"], action)
+        np.testing.assert_allclose(by_command[4]["action_residual"], 0, atol=1e-6)
+        for left, right in zip(by_index[:4], by_command[:4], strict=True):
             np.testing.assert_allclose(left, right, atol=2e-4)  # float32 commands
 
 

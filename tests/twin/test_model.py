@@ -128,8 +128,8 @@ def test_starting_slip_matches_coulomb_friction(friction: float) -> None:
     drive(sim, 1.0, 0.0, 1.0)
     rolled = sim.qpos[0, 7:9].mean() * WHEEL_RADIUS_M
     given = friction * GRAVITY * wheel_share()
-    way = given / 2 if given < 1 else 1 - 1 / (2 * given)
-    expected = 1 - way / (1 - 1 / (2 * ACCEL_LIMIT[0]))
+    distance = given / 2 if given < 1 else 1 - 1 / (2 * given)
+    expected = 1 - distance / (1 - 1 / (2 * ACCEL_LIMIT[0]))
     assert 1 - (sim.pose()[0, 1] - 1.0) / rolled == pytest.approx(expected, rel=0.15)
 
 
@@ -181,13 +181,13 @@ def test_starting_speed_matches_motors_and_mass(payload: float) -> None:
 
 
 def test_distance_scales_with_wheel_radius() -> None:
-    way = []
+    distances = []
     for scale in (1.0, 0.95):
         sim = simulation(0.01)
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(wheel_radius_scale=scale, **QUIET))
         drive(sim, 0.4, 0.0, 4.0)
-        way.append(sim.pose()[0, 1] - 1.0)
-    assert way[1] / way[0] == pytest.approx(0.95, abs=0.01)
+        distances.append(sim.pose()[0, 1] - 1.0)
+    assert distances[1] / distances[0] == pytest.approx(0.95, abs=0.01)
 
 
 def test_turn_rate_scales_with_track() -> None:

@@ -94,15 +94,15 @@ def test_fit_and_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None
 def test_single_step_equals_start_of_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
     rows = log_segments(steps, 1.2).row[::3]
     warehouse = default_warehouse() if mapped else None
-    one, many = (
+    single, longer = (
         drive_open_loop(
             steps.task, start_of(steps, rows, count), [Perturbation(), LATE], warehouse=warehouse
         )
         for count in (1, 4)
     )
-    assert one.pose.shape == (2, len(rows), 2, 3)
-    assert np.array_equal(one.pose, many.pose[:, :, :2])
-    for name, values in one.signals.items():
-        assert np.array_equal(values, many.signals[name][..., :2]), name
-    assert np.array_equal(one.sliding_mps, many.sliding_mps[..., :2])
-    assert one.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)
+    assert single.pose.shape == (2, len(rows), 2, 3)
+    assert np.array_equal(single.pose, longer.pose[:, :, :2])
+    for name, values in single.signals.items():
+        assert np.array_equal(values, longer.signals[name][..., :2]), name
+    assert np.array_equal(single.sliding_mps, longer.sliding_mps[..., :2])
+    assert single.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)

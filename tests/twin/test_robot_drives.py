@@ -138,9 +138,9 @@ def test_perturbations_apply_to_each_drive_type() -> None:
         ]
         result = drive_open_loop(task, start, twins, robot=robot_model(robot, body))
         assert not result.diverged.any()
-        way = result.pose[:, 0, -1, 0] / result.pose[0, 0, -1, 0]
-        assert way[1:3] == pytest.approx([0.9, 0.95], abs=0.015)
-        assert way[4] == pytest.approx(1.0, abs=0.02)
+        distance = result.pose[:, 0, -1, 0] / result.pose[0, 0, -1, 0]
+        assert distance[1:3] == pytest.approx([0.9, 0.95], abs=0.015)
+        assert distance[4] == pytest.approx(1.0, abs=0.02)
         seen[robot.drive] = result.pose[3, 0, -1, 2]
     assert seen["omnidirectional"] > 0.1  # the left wheels lag, so the robot turns left
     assert abs(seen["ackermann"]) < 0.02  # the front wheels keep it straight

@@ -45,14 +45,14 @@ def test_few_tracks_without_people():
 
 
 def test_restored_environment_keeps_tracks():
-    one, other = environment("near_collision"), environment("near_collision")
+    original, restored = environment("near_collision"), environment("near_collision")
     rng = np.random.default_rng(0)
     for _ in range(40):
-        one.step(rng.integers(0, 3, 4))
-    other.load_state_dict(one.state_dict())
+        original.step(rng.integers(0, 3, 4))
+    restored.load_state_dict(original.state_dict())
     for _ in range(15):
         actions = rng.integers(0, 3, 4)
-        seen, *_ = one.step(actions)
-        again, *_ = other.step(actions)
+        seen, *_ = original.step(actions)
+        again, *_ = restored.step(actions)
         np.testing.assert_array_equal(seen, again)
-    assert len(one.sensing.tracker.tracks)  # type: ignore[union-attr]
+    assert len(original.sensing.tracker.tracks)  # type: ignore[union-attr]
