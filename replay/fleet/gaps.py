@@ -126,10 +126,7 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
 
 
 def reorder(yields: Yields, names: pa.Array, found: F64) -> F64:
-    """Reorder values `found` of the episodes `names` to the order of `yields`, (E,); NaN if none.
-
-    `found` has one value per name.
-    """
+    """Reorder values `found` of episodes `names` to the order of `yields`, (E,); NaN if none."""
     place = {name: index for index, name in enumerate(names.to_pylist())}
     padded = np.append(found, np.nan)
     return padded[[place.get(name, -1) for name in yields.episode_id]]
@@ -173,8 +170,6 @@ def find_gaps(
     """Return the store's episodes and its gaps: gaps in episodes first, then in rows, by size.
 
     Args:
-        store: the store.
-        mixture: the mixture whose shares should be filled.
         name: the mixture's name, for reports.
         folder: the folder for relative paths of the mixture's other stores.
         kinds: kinds of missions that can be driven: conditions of the store, or shipped ones.
@@ -261,10 +256,7 @@ def _find_strata_gaps(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Ga
 
 
 def _rank_zones(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
-    """Return up to three zones whose rows in a stratum are furthest below their share of driving.
-
-    A zone's part of `needed` is its share of all rows.
-    """
+    """Return up to three zones whose rows are furthest below `needed` x their share of all rows."""
     column = plan.rows["zone"].combine_chunks()
     names, zone = column.dictionary.to_pylist(), column.indices.fill_null(len(column.dictionary))
     size = len(names) + 1

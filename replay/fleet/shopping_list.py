@@ -107,8 +107,6 @@ def shopping_list(
     """Plan what fills the gaps, at the rates of the store's episodes.
 
     Args:
-        yields: the store's episodes.
-        gaps: the gaps of `find_gaps`.
         unit: missions of a kind, or hours of logging; None: missions if recordings have true
             conditions (a simulator drives any kind ordered), else hours.
     """

@@ -54,10 +54,7 @@ class LoggedSampler(Stateful):
     else by a row of another stratum (offline only), else it is left out.
 
     Args:
-        controller: the current shares.
-        sampler: draws row numbers by these shares.
         rows: (n, W) the packed rows.
-        stratum_rows: the row numbers of each stratum.
         weights: importance weights: (n,), or weights that follow the shares; None: all 1.
         rng: the generator for replacements.
     """
@@ -229,7 +226,6 @@ def sampler_for(
     """Build a sampler that draws from a panel by its mixture.
 
     Args:
-        panel: the panel.
         batch_size: logged rows of a batch.
         seed: seed of the draws: an integer of at least 0, or several.
         planned: number of draws, over which `max_replays_per_row` is spread; default: the

@@ -85,7 +85,6 @@ def install_planned(
     """Create macros in a store's connection whose rows come from a plan in Python.
 
     Args:
-        store: the store.
         macros: names of the macros; each takes the name of a mixture.
         tables: SQL function that `script` calls -> its columns, and what turns a plan into a table.
         script: the SQL that creates the macros.

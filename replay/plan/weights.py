@@ -60,7 +60,6 @@ class RowWeights:
         code: (N,) each row's stratum, never -1.
         state_code: (N,) the stratum that its state alone would give, -1 for none.
         strata: (S,) timing and correction of each stratum.
-        rule: the mixture's `clip`.
         outcome: (N, S) the probability of each "density_ratio" stratum given a row's state and
             action (0 for the other strata), or None.
         natural: (S,) natural share of each stratum, if the rows are a selection (an archive, a
@@ -171,7 +170,6 @@ class WeightsInForce:
         state_code: (n,) the stratum that its state alone would give, within its source.
         strata: (K * S,) timing and correction of each stratum.
         sources: K, the number of stores of the panel.
-        rule: the mixture's `clip`.
         outcome: (n, S) as in `RowWeights`, or None.
         natural: for each source (S,) as in `RowWeights`, or None; (): None for all.
     """
@@ -240,7 +238,6 @@ class OutcomeModel:
     Args:
         features: (n, D).
         outcome: (n,) in 0..outcomes - 1.
-        outcomes: the number of outcomes.
         weight: (n,) how many rows each row represents; None: all 1.
     """
 

@@ -205,7 +205,6 @@ def find_origin(
     """Look up a transition in stores, first to last.
 
     Args:
-        sources: the stores.
         transition: its id.
         recording: its recording, to read the messages of its tick; None: do not read them.
 
