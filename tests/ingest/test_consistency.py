@@ -184,7 +184,7 @@ def _pose_times(steps: Any) -> Any:
     return fine[np.argmin(away, axis=1)]
 
 
-def test_offset_of_recorder_clock_is_no_finding(profile):
+def test_recorder_clock_offset_gives_no_finding(profile):
     assert findings_in(shift_all_stamps(winding_drive(), 3.0), profile)[0] == []
 
 
@@ -215,7 +215,7 @@ def test_recorder_clock_set_back_starts_segment(profile, tmp_path, back_s, stora
     assert np.abs(steps.signals["localised_speed_mps"]).max() < 0.7
 
 
-def test_single_topic_out_of_order_is_no_clock_set_back(profile, tmp_path):
+def test_single_topic_out_of_order_starts_no_segment(profile, tmp_path):
     topics, middle = winding_drive(), START_NS + 20 * NS
     late = without(topics["/imu"], topics["/imu"].log_time_ns < middle)
     rest = without(topics["/imu"], topics["/imu"].log_time_ns >= middle)

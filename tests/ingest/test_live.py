@@ -50,7 +50,7 @@ def export_policy(folder: Path, profile: str = "warehouse_amr") -> Path:
 
 
 @pytest.mark.long
-def test_live_observations_equal_those_of_ingest(tmp_path):
+def test_live_observations_match_ingest(tmp_path):
     """The task has tracks and observation entries of its own, which are the last 20."""
     nearing = "lag(clearance_m, 2) OVER episode - clearance_m"
     own = f'observed = {{ nearing = "{nearing}", go = "goal_distance_m" }}\n'

@@ -93,7 +93,7 @@ def test_counts_of_damaged_summary_are_ignored(tmp_path):
         assert [loss.messages for loss in recording.lost_messages] == [None]
 
 
-def test_summary_with_crc_overrides_chunk_without(tmp_path):
+def test_summary_with_crc_overrides_chunk_without_crc(tmp_path):
     """A definition is damaged in a chunk without CRC and intact in a summary with CRC."""
     whole = write_mcap(tmp_path / "whole.mcap")
     content = bytearray(write_mcap(tmp_path / "plain.mcap", compression=0).read_bytes())

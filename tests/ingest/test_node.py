@@ -124,7 +124,7 @@ def test_node_commands_only_when_active(policy: Path) -> None:
     assert not any(topic != COMMAND and heard for topic, heard in graph.heard.items())
 
 
-def test_latched_message_is_requested_only_from_latching(policy: Path) -> None:
+def test_latched_message_is_requested_from_latching_publisher(policy: Path) -> None:
     """The stub fails if a volatile publisher is asked for kept messages; rclpy only warns."""
     latching, goal = QoS(1, durability=Durability.TRANSIENT_LOCAL), "geometry_msgs/msg/PoseStamped"
     for earlier in (True, False):

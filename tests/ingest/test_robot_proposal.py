@@ -197,7 +197,7 @@ def test_proposal_takes_robot_from_urdf_file(bag, tmp_path):
     assert by_logs.lidar.beams == own.robot.lidar.beams
 
 
-def test_description_of_arm_does_not_hide_that_of_base(tmp_path: Path) -> None:
+def test_arm_description_does_not_hide_base_description(tmp_path: Path) -> None:
     texts = {"/arm": robot(), "/base": robot(wheels((0.2, 0.22), (0.2, -0.22)))}
     topics = typed_topics(Drive())
     for place, text in texts.items():

@@ -33,7 +33,7 @@ with open_recording(sys.argv[1]) as recording:
 
 
 @pytest.mark.parametrize("kind", ["chunks", "loose", "sqlite3"])
-def test_recording_that_shrinks_while_read(kind: str, tmp_path: Path) -> None:
+def test_recording_shrinking_while_read_is_reported(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     if kind == "sqlite3":
         path = next(write_bag(tmp_path / "run", 300).glob("*.db3"))

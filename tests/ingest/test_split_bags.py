@@ -112,7 +112,7 @@ def rename_parts(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [rename_part, rename_parts])
-def test_renamed_parts_are_no_damage(split, change: Callable):
+def test_renamed_parts_are_not_damage(split, change: Callable):
     folder = split()
     change(folder)
     count, damage, notes = open_and_describe(folder)

@@ -39,7 +39,7 @@ def test_rows_have_the_store_schema():
             assert table[field.name].null_count == 0, field.name
 
 
-def test_next_observation_equals_that_of_next_row():
+def test_next_observation_equals_observation_of_next_row():
     drive = Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)])
     table = rows_of(drive.topics())
     before, after = vector_column(table, "observation"), vector_column(table, "next_observation")
