@@ -224,8 +224,6 @@ def cut_short() -> None:
     """Make what takes minutes take a second; nothing else is changed."""
     import msgspec
 
-    from restock import cli
-    from restock.cli.start import demo
     from restock.replay.fleet import forecast
     from restock.train import prepare
     from restock.train.evaluation import eval_run, ope, policies
@@ -292,13 +290,6 @@ def cut_short() -> None:
             done = subprocess.run(["restock", *arguments], stdout=file, stderr=file, check=False)
         assert done.returncode in (0, 3), log.read_text()
 
-    @contextmanager
-    def before_it(stage: Any, say: Any) -> Iterator[Any]:
-        """Yield what the demo runs in a process of its own would not be cut short there."""
-        code = cli.main(list(stage.beside)) if stage.beside else 0
-        yield lambda: code
-
-    demo._beside = before_it
     forecast.REPLICATES = forecast.forecast.__kwdefaults__["replicates"] = 20
     policies.UPDATES = (0, 20)
     fed_rows.drive_twin.__kwdefaults__["steps"] = 60
