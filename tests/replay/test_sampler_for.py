@@ -28,7 +28,7 @@ EVERY = (
     "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
 )
 MIXTURES = {
-    "in turns": "within = 'without_replacement'\n" + EVERY,
+    "without replacement": "within = 'without_replacement'\n" + EVERY,
     "uniform": "within = 'uniform'\n" + EVERY,
     "limited": "max_replays_per_row = 3\n" + EVERY,
     "limited, uniform": "max_replays_per_row = 3\nwithin = 'uniform'\n" + EVERY,

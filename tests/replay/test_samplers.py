@@ -1,6 +1,5 @@
 """Every sampler meets exact quotas over time and draws the same after a restart."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,51 +19,16 @@ SHARES = [0.7, 0.3]
 PARTS = st.lists(st.integers(0, 1000), min_size=1, max_size=9).filter(lambda s: sum(s) > 0)
 RULES = {
     "with replacement": ["uniform", "uniform"],
-    "in turns": ["without_replacement", "without_replacement"],
+    "without replacement": ["without_replacement", "without_replacement"],
     "PER": ["per", "per"],
-    "in turns beside PER": ["without_replacement", "per"],
+    "without replacement beside PER": ["without_replacement", "per"],
 }
 PER = Prioritised(per_alpha=0.7)
 
 
-class Drawing:
-    """A sampler whose draws are copied."""
-
-    def __init__(self, sampler: Any) -> None:
-        self.sampler = sampler
-
-    def draw(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        rows, strata = self.sampler.draw()
-        weights = self.sampler.drawn_weights
-        return rows.copy(), strata.copy(), None if weights is None else weights.copy()
-
-    def update(self, rows: np.ndarray, td_abs: np.ndarray) -> None:
-        self.sampler.update(rows, td_abs)
-
-
-Make = Callable[..., Drawing]  # seed, batch_size
-
-
-@pytest.fixture(params=RULES)
-def way(request) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def make(way: str) -> Make:
-    def made(seed: int = 0, batch_size: int = 50) -> Drawing:
-        rng = np.random.default_rng(seed)
-        return Drawing(
-            QuotaSampler(STRATA, SHARES, batch_size, rng, within=RULES[way], prioritised=PER)
-        )
-
-    return made
-
-
-def in_turns(way: str) -> list[np.ndarray]:
-    """Return the strata whose rows are drawn without replacement."""
-    named = zip(STRATA, RULES[way], strict=True)
-    return [rows for rows, rule in named if rule == "without_replacement"]
+def make(rules: list[str], seed: int = 0, batch_size: int = 50) -> QuotaSampler:
+    rng = np.random.default_rng(seed)
+    return QuotaSampler(STRATA, SHARES, batch_size, rng, within=rules, prioritised=PER)
 
 
 def errors() -> np.ndarray:
@@ -77,19 +41,20 @@ def priority(rule: str, td_abs: np.ndarray) -> np.ndarray:
     return (td_abs + EPSILON) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
 
 
-def test_quotas_are_exact_and_rows_follow_rule(make, way):
-    drawing, td = make(batch_size=40), errors()  # 28 and 12
+@pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
+def test_quotas_are_exact_and_rows_follow_rule(rules):
+    sampler, td = make(rules, batch_size=40), errors()  # 28 and 12
     for rows in STRATA:
-        drawing.update(rows, td[rows])
+        sampler.update(rows, td[rows])
     counts = np.zeros(400)
     for _ in range(4000):
-        drawn, stratum, _ = drawing.draw()
+        drawn, stratum = sampler.draw()
         assert np.bincount(stratum).tolist() == [28, 12]
         assert ((drawn % 2 == 1) == (stratum == 1)).all()
         np.add.at(counts, drawn, 1)
-    for rows, total, rule in zip(STRATA, (112_000, 48_000), RULES[way], strict=True):
+    for rows, total, rule in zip(STRATA, (112_000, 48_000), rules, strict=True):
         assert counts[rows].sum() == total
-        if any(rows is turns for turns in in_turns(way)):
+        if rule == "without_replacement":
             assert np.ptp(counts[rows]) <= 1
         else:
             share = priority(rule, td[rows])
@@ -97,29 +62,31 @@ def test_quotas_are_exact_and_rows_follow_rule(make, way):
     assert counts.sum() == 160_000
 
 
+@pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
 @pytest.mark.parametrize("before", [0, 3, 107])  # after 107, rows drawn ahead were returned
-def test_restored_sampler_continues_exactly(make, tmp_path, before):
-    def go_on(drawing: Drawing, batches: int, seed: int) -> list[Any]:
+def test_restored_sampler_continues_exactly(rules, tmp_path, before):
+    def go_on(sampler: QuotaSampler, batches: int, seed: int) -> list[Any]:
         observed: list[Any] = []
         rng = np.random.default_rng(seed)
         for index in range(batches):
             if index == 100:
-                drawing.sampler.set_shares([0.2, 0.8])
+                sampler.set_shares([0.2, 0.8])
             if index == 105:
-                drawing.sampler.set_batch_size(31)
-            drawn, stratum, weights = drawing.draw()
+                sampler.set_batch_size(31)
+            drawn, stratum = sampler.draw()
+            weights = sampler.drawn_weights
             observed += [drawn.tolist(), stratum.tolist()]
             observed.append(None if weights is None else weights.tolist())
-            drawing.update(drawn, rng.uniform(0, 9, len(drawn)))
+            sampler.update(drawn, rng.uniform(0, 9, len(drawn)))
         return observed
 
-    first, second, third = make(1), make(2), make(3)
+    first, second, third = (make(rules, seed) for seed in (1, 2, 3))
     go_on(first, before, seed=1)
-    state = first.sampler.state_dict()
+    state = first.state_dict()
     checkpoint.save(tmp_path / "state", state)
-    second.sampler.load_state_dict(checkpoint.load(tmp_path / "state"))
-    third.sampler.load_state_dict(through_json(state))
-    assert second.sampler.batch_size == first.sampler.batch_size
+    second.load_state_dict(checkpoint.load(tmp_path / "state"))
+    third.load_state_dict(through_json(state))
+    assert second.batch_size == first.batch_size
     expected = go_on(first, 250, seed=2)  # into blocks drawn later
     assert go_on(second, 250, seed=2) == expected
     assert go_on(third, 250, seed=2) == expected
