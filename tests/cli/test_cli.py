@@ -17,11 +17,6 @@ from restock.renamed import VERBS as RENAMED
 COMMANDS = [*cli.VERBS, *(f"{verb} {job}" for verb in cli.JOBS for job in cli.JOBS[verb])]
 
 
-def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "restock", *args]
-    return subprocess.run(command, capture_output=True, text=True, **kwargs)  # type: ignore[call-overload]
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_verb_has_help(command: str, shell: Shell) -> None:
     out = shell.out(*command.split(), "--help")
@@ -66,7 +61,8 @@ def test_unknown_verb_suggests_nearest(shell: Shell) -> None:
 
 
 def test_version_is_printed() -> None:
-    done = restock("--version")
+    command = [sys.executable, "-m", "restock", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0
     assert done.stdout.startswith("restock 0.")
     assert f"\nnative code {native.state()}\n" in done.stdout

@@ -202,23 +202,20 @@ def test_task_of_newer_version_is_reported(task, root, tmp_path, shell):
         assert "newer Restock" in err
 
 
-def writers(root: Path, out: Path) -> list[list[str]]:
-    store, run = str(root / "store"), str(root / "run")
-    return [
+def test_unwritable_target_is_reported(root, tmp_path, capsys):
+    store, run, out = str(root / "store"), str(root / "run"), tmp_path / "file"
+    out.write_text("a file, where a folder is asked for")
+    for argv in (
         ["sql", store, "--export", str(out / "views.sql")],
         ["sql", store, "--export", str(out / "views.duckdb")],
         ["export", store, "--to", "parquet", "--out", str(out / "x.parquet")],
         ["export", run, "--to", "onnx", "--out", str(out / "x.onnx")],
         ["mix", store, "--mixture", "coverage", "--out", str(out / "panel")],
         ["report", run, "--out", str(out / "r.html")],
-    ]
-
-
-def test_unwritable_target_is_reported(root, tmp_path, capsys):
-    (tmp_path / "file").write_text("a file, where a folder is asked for")
-    for argv in [*writers(root, tmp_path / "file"), ["train", "--out", str(tmp_path / "file/run")]]:
-        assert check(argv, tmp_path / "file", capsys) == 2
-    assert (tmp_path / "file").read_text().startswith("a file")
+        ["train", "--out", str(out / "run")],
+    ):
+        assert check(argv, out, capsys) == 2
+    assert out.read_text().startswith("a file")
 
 
 @pytest.mark.parametrize(

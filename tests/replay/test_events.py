@@ -72,13 +72,6 @@ def events_of(store: Store) -> dict[str, dict[str, Any]]:
     return {row["event_id"]: row for row in rows}
 
 
-def compare(store: Store) -> None:
-    by_hand, observed = events_by_hand(store), events_of(store)
-    assert observed.keys() == by_hand.keys()
-    for name, row in by_hand.items():
-        assert {key: observed[name][key] for key in row} == row, name
-
-
 def test_events_match_plain_loop(tmp_path):
     """Some rows are missing, drivers alternate, and a third of the episodes end in recovery."""
     tables = []
@@ -97,7 +90,10 @@ def test_events_match_plain_loop(tmp_path):
     with Store(
         write_store(tmp_path / "store", tables, tags=[{"robot": "a"}, {"robot": "b"}])
     ) as store:
-        compare(store)
+        expected, found = events_by_hand(store), events_of(store)
+        assert found.keys() == expected.keys()
+        for name, row in expected.items():
+            assert {key: found[name][key] for key in row} == row, name
         rows = store.sql(
             "SELECT count(*), count(DISTINCT event_id), count(*) FILTER"
             " (NOT list_contains(conditions, events.condition)"

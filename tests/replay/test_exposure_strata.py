@@ -18,7 +18,6 @@ from restock.replay.store.audit import load_thresholds, run_audits, shipped_audi
 from restock.replay.store.store import Store
 
 EPISODES = 60
-GOAL_REWARD = 5.0  # of the task
 # Every third episode is exposed to traffic; every other of these came too near and failed.
 EXPOSED = [number % 3 == 0 for number in range(EPISODES)]
 NEAR = [number % 6 == 0 for number in range(EPISODES)]
@@ -43,7 +42,7 @@ def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
                 for e, s in zip(episode, step, strict=True)
             ],
             "bumped": np.zeros(len(rows), np.bool_),
-            "reward": np.where(last & success, GOAL_REWARD, -0.02),
+            "reward": np.where(last & success, 5.0, -0.02),  # rewards of the task
             "terminated": last & success,
             "truncated": last & ~success,
         },
@@ -58,9 +57,11 @@ def success_in(plan: PanelPlan, stratum: str, rows: pa.Table) -> float:
     return len(mine & good) / len(mine)
 
 
-NOMINAL = "[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'nominal'\nunit = 'episode'\n"
-BY_OUTCOME = NOMINAL + "share = 0.5\n[each_condition]\nunit = 'episode'\nshare = 'equal'"
-BY_EXPOSURE = BY_OUTCOME + "\nkind = 'exposure'"
+BY_OUTCOME = (
+    "[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'nominal'\nunit = 'episode'\nshare = 0.5\n"
+    "[each_condition]\nunit = 'episode'\nshare = 'equal'\n"
+)
+BY_EXPOSURE = BY_OUTCOME + "kind = 'exposure'"
 
 
 def test_exposure_stratum_keeps_successes(tmp_path):

@@ -35,7 +35,6 @@ def store(tmp_path_factory) -> Path:
     return write_store(tmp_path_factory.mktemp("gaps") / "store", rows)
 
 
-FEW = {"min_effective_episodes": 5}
 ASKING = """
 max_replays_per_row = 2
 planned_draws = 1000
@@ -123,7 +122,10 @@ def test_condition_without_primary_rows_has_no_audit_gap(tmp_path):
     named = [rarer.get(name, name) for name in rows["condition"].to_pylist()]
     rows = replaced(rows, {"condition": named})
     with Store(write_store(tmp_path / "store", [rows])) as store:
-        mixture, limits = parse_mixture(ASKING), {"few_effective_episodes": FEW}
+        mixture, limits = (
+            parse_mixture(ASKING),
+            {"few_effective_episodes": {"min_effective_episodes": 5}},
+        )
         _, gaps = find_gaps(store, mixture, name="mine", kinds=KINDS, thresholds=limits)
         query = "SELECT primary_rows, rows_held FROM coverage_by_condition"
         ((names, holds),) = store.sql(f"{query} WHERE condition = 'wheel_slip'").fetchall()

@@ -9,7 +9,6 @@ import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.paths import SHARED
-from support.shell import Shell
 from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
@@ -20,12 +19,6 @@ from restock.replay.store.store import Store
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 
 NEATO = SHARED / "fleet-neato"
-
-
-def audited(store: Path, shell: Shell) -> dict[str, list[dict[str, object]]]:
-    """Return the first rows of each audit that failed."""
-    findings = shell.json("audit", store, code=1)["audits"]
-    return {found["audit"]: found["sample"] for found in findings if found["status"] == "fail"}
 
 
 def copy_of(
@@ -55,7 +48,9 @@ def test_drive_replayed_a_year_later_is_found(tmp_path, shell):
     folders = ["2022-original", "2023-replayed", "2024-danpark"]
     paths = [str(NEATO / folder) for folder in folders]
     assert main(["ingest", *paths, "--profile", profile, "--store", store]) in (0, 3)
-    (found,) = audited(Path(store), shell)["repeated_steps"]
+    audits = {audit["audit"]: audit for audit in shell.json("audit", store, code=1)["audits"]}
+    assert audits["repeated_steps"]["status"] == "fail"
+    (found,) = audits["repeated_steps"]["sample"]
     names = {Path(str(found[name])).name for name in ("source_file", "same_as_file")}
     assert names == {"macfirst_floor_take_2", "mac_take_2_bag"}
     assert float(str(found["share"])) > 0.95

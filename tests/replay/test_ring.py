@@ -140,13 +140,6 @@ def test_strata_follow_labels_and_eviction():
         assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
 
 
-def assert_alike(one: FreshRing, other: FreshRing) -> None:
-    pairs = zip(leaves(one.state_dict()), leaves(other.state_dict()), strict=True)
-    for (path, value), (same_path, same) in pairs:
-        assert path == same_path
-        np.testing.assert_array_equal(value, same, err_msg=path)
-
-
 @pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
 @pytest.mark.parametrize("reserved", [{}, {"wheel_slip": 20}])
 def test_restored_ring_continues_exactly(steps, reserved):
@@ -156,7 +149,10 @@ def test_restored_ring_continues_exactly(steps, reserved):
     other.load_state_dict(through_json(ring.state_dict()))
     for one in (ring, other):
         label_rarely(one, Drive(2, 11), 200)
-    assert_alike(ring, other)
+    pairs = zip(leaves(ring.state_dict()), leaves(other.state_dict()), strict=True)
+    for (path, value), (same_path, same) in pairs:
+        assert path == same_path
+        np.testing.assert_array_equal(value, same, err_msg=path)
     rngs = [np.random.default_rng(9), np.random.default_rng(9)]
     for _ in range(5):
         one, two = (r.sample(10, rng) for r, rng in zip((ring, other), rngs, strict=True))

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from restock.replay.plan.candidates import KEYS, rows_in_order
 
 TEXT = ("recording_id", "episode_id", "zone")
-BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
 
 
 def rows_of(recordings: int, episodes: int, steps: int) -> pa.Table:
@@ -40,16 +39,13 @@ def in_order(batches: list[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
     return rows_in_order(batches, schema, text=TEXT, dropped=("episode_index",))
 
 
-def expected(table: pa.Table) -> pa.Table:
-    return table.sort_by(BY).drop_columns(["episode_index"])
-
-
 def check(found: pa.Table, table: pa.Table) -> None:
-    wanted = expected(table)
-    assert found.column_names == wanted.column_names
-    assert found.to_pylist() == wanted.to_pylist()
+    keys = [(key, "ascending") for key in ("recording_id", *KEYS)]
+    expected = table.sort_by(keys).drop_columns(["episode_index"])
+    assert found.column_names == expected.column_names
+    assert found.to_pylist() == expected.to_pylist()
     for name in TEXT:  # codes in the order of the first rows that have them
-        values = [value for value in wanted[name].to_pylist() if value is not None]
+        values = [value for value in expected[name].to_pylist() if value is not None]
         column = found[name].combine_chunks()
         assert column.dictionary.to_pylist() == list(dict.fromkeys(values))
 

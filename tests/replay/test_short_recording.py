@@ -13,12 +13,10 @@ from restock.replay.mixture.mixture import parse_mixture, shipped_mixtures
 from restock.replay.panel.panel import Panel
 from restock.replay.plan.exclusions import GAP_S, split_for_evaluation
 
-SEED = 3  # of an episode of 58 steps
-
 
 def drive(steps: int) -> pa.Table:
     """Return the first steps of one episode."""
-    table = recording_transitions(1, episodes=1, seed=SEED)
+    table = recording_transitions(1, episodes=1, seed=3)  # 58 steps
     assert len(table) >= steps
     return table.slice(0, steps)
 
