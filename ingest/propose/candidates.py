@@ -22,8 +22,8 @@ from restock.ingest.propose.roles import usable_topics
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
 MAX_A_TOPIC = 8
-# (pattern of the end of a field's path, its unit, ending of a signal's name in that unit). ROS
-# messages use SI units (REP 103).
+# Rules for the unit of a field: (pattern for the end of its path, unit, suffix of the signal's
+# name). ROS messages use SI units (REP 103).
 UNITS = (
     (r"angular_velocity\.\w|angular\.[xyz]|velocity\[.*\]", "rad/s", "radps"),
     (r"linear_acceleration\.\w|accel\.linear\.\w", "m/s²", "mps2"),
@@ -57,11 +57,11 @@ class Candidate:
     unit: str  # "" if unknown
 
     def signal(self) -> CustomSignal:
-        """Return the signal that its table declares."""
+        """Return the custom signal that the table of `toml` declares."""
         return CustomSignal(self.topic.name, self.topic.type, self.path, self.unit or "1")
 
     def toml(self, max_age_s: float | None) -> list[str]:
-        """Write its table, line by line."""
+        """Return the TOML lines of the [signals.NAME] table."""
         lines = [
             f"[signals.{self.name}]",
             f"topic = {json.dumps(self.topic.name)}",
@@ -116,9 +116,9 @@ def _keep_changing(
 
 
 def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
-    """Yield the paths of a topic's numbers, and the words to name each by.
+    """Yield (path, words) of each number in a topic; the signal's name is made from the words.
 
-    In lists, only numbers with a name or key beside them are included.
+    Of the numbers in lists, only those with a name or key beside them are included.
     """
     fields = {field.path: field for field in recording.fields(topic.name)}
     if "name" in fields and fields["name"].kind == "string" and fields["name"].dims:
@@ -134,7 +134,7 @@ def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
                         yield (f"{path}[{name}]",) * 2
         return
     status = "status[].name", "status[].values[].key", "status[].values[].value"
-    if fields.keys() >= {*status}:  # diagnostics
+    if fields.keys() >= {*status}:  # diagnostic_msgs/DiagnosticArray
         read: Any = recording.read({topic.name: status})[topic.name].fields
         names, keys, texts = (read[path].values for path in status)
         triples = zip(
@@ -150,7 +150,7 @@ def _paths(recording: Recording, topic: TopicInfo) -> Iterator[tuple[str, str]]:
 
 
 def _candidate(topic: TopicInfo, path: str, words: str) -> Candidate:
-    """Name a field by its topic, its own `words` and its unit."""
+    """Return the candidate of a field, named after the topic, `words` and the unit."""
     units = (found for pattern, *found in UNITS if re.search(rf"(^|[._])({pattern})$", words))
     unit, ending = next(units, ("", ""))
     last = [part for part in re.split(r"[.\[\]]+", words) if part and part != "data"][-3:]

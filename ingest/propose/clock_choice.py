@@ -24,21 +24,21 @@ from restock.ingest.steps.clocks import STAMP
 FASTEST_S, SLOWEST_S = 0.08, 0.5  # limits of the proposed control period
 EVENTS_S = 0.2  # the control period if commands are not steady
 STEADY_S = (0.08, 0.5)  # if commands are this far apart, each one is a tick
-PAUSE = 5.0  # a gap longer than this many median gaps is a pause in driving
+PAUSE = 5.0  # a gap longer than this multiple of the median gap is a pause in driving
 MAX_HOLD_S = 5.0
-MAX_OFF_CLOCK = 0.05  # share of a topic's messages
+MAX_OFF_CLOCK = 0.05  # largest share of a topic's messages that may be off the clock
 
 
 @dataclass(frozen=True)
 class Gaps:
     """The times between the commands of a recording, in log time."""
 
-    count: int = 0  # of commands
+    count: int = 0  # number of commands
     period_s: float | None = None  # the median gap
     driving_s: float = 0.0  # the longest gap that is not a pause
     mean_s: float = 0.0
-    hold_s: float | None = None  # how long the robot went on with a command
-    sensor_s: float = 0.0  # between two messages of pose or wheels, whichever are rarer
+    hold_s: float | None = None  # how long the robot keeps following a command
+    sensor_s: float = 0.0  # time between two messages of pose or of wheels, the rarer of the two
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Gaps:
@@ -66,10 +66,10 @@ class ClockChoice:
 
     @classmethod
     def of(cls, gaps: Gaps, alignment: str, pace: float = 1.0) -> ClockChoice:
-        """Choose a clock by gaps in log time, on an alignment clock that runs at this pace."""
+        """Choose a clock from the gaps between commands; `pace` converts them to alignment time."""
         middle = None if gaps.period_s is None else gaps.period_s * pace
         steady = middle is not None and STEADY_S[0] <= middle <= STEADY_S[1]
-        # Commands at key presses or in bursts do not show how often to decide.
+        # Commands from key presses or in bursts do not show a control period; streamed ones do.
         streamed = middle is not None and gaps.mean_s * pace <= 2 * middle < 2 * STEADY_S[0]
         usual = (middle if steady or streamed else EVENTS_S) or EVENTS_S
         least = FASTEST_S if steady else max(FASTEST_S, gaps.sensor_s * pace)
@@ -89,7 +89,7 @@ class ClockChoice:
         )
 
     def at_a_rate(self) -> ClockChoice:
-        """Return the choice with one tick per period instead of one per command."""
+        """Return this choice with one tick per control period instead of one per command."""
         return replace(self, steps="rate", max_gap_s=max(0.5, _up(2.5 * self.period_s)))
 
 
@@ -99,7 +99,7 @@ def drivable(period_s: float) -> float:
     The twin divides a period into equal parts of at most 0.1 s, each a whole number of hundredths.
     """
     parts = int(np.ceil(round(period_s * 10, 6)))
-    # Also try one part less: .2015 s is nearer to 2 of .1 s than to 3 of .07 s.
+    # Also try one part less: 0.2015 s is nearer to 2 parts of 0.1 s than to 3 of 0.07 s.
     near = {
         count: round(period_s * 100 / count)
         for count in (parts - 1, parts)
@@ -146,9 +146,9 @@ def by_log_time(gaps: Gaps, why: str) -> ClockChoice:
 def _by_stamp(
     columns: dict[str, TopicColumns], latched: frozenset[str], gaps: Gaps
 ) -> tuple[ClockChoice, str]:
-    """Choose a clock by header stamps; also return why that does not work, or ""."""
+    """Choose a clock by header stamps; also return why the stamps do not work, or ""."""
     choice = ClockChoice.of(gaps, STAMP)
-    for _ in range(3):  # the period depends on the pace, and the pace on a tolerance by the period
+    for _ in range(3):  # repeated, as the period depends on the pace, and the pace on the period
         try:
             _, report = align(columns, Clock(), latched, tolerance_s=choice.period_s / 2)
         except RecordingError as error:

@@ -34,7 +34,8 @@ from restock.ingest.steps.frames import PoseSeries
 from restock.ingest.task.task import wrap_angle
 
 PASSED_WITHIN_S = 0.5
-MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # of changes that one topic repeats from another
+# Least number and shares of a topic's changes that must repeat another topic's commands.
+MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5
 Fit = tuple[TopicInfo, Kind]
 
 
@@ -48,7 +49,7 @@ class CommandSource:
     max_age_s: float
 
     def toml(self, wheelbase_m: float) -> list[str]:
-        """Write its table; a source with steering angles gets the command's wheelbase."""
+        """Return the TOML lines of its table, with the wheelbase if it has steering angles."""
         topic, kind = self.fit
         fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
         steers = "steering_rad" in kind.fields
@@ -85,21 +86,21 @@ class CommandLog:
 
     @property
     def measured(self) -> bool:
-        """Return whether it is odometry, in place of commands."""
+        """Return whether the topic is odometry, used as commands."""
         return is_motion(self.fit[0].type)
 
     @property
     def steered(self) -> bool:
-        """Return whether it has the angle of the front wheels, as for a car."""
+        """Return whether the commands contain the angle of the front wheels, as for a car."""
         return "steering_rad" in self.fit[1].fields
 
     @cached_property
     def changed(self) -> Ints:
-        """Return the rows that differ from the one before."""
+        """Return the rows whose command differs from that of the row before."""
         return np.flatnonzero((np.diff(self.values, axis=0) != 0).any(axis=1)) + 1
 
     def passed_on(self, output: CommandLog) -> int:
-        """Count the changes of `output` to this topic's last command."""
+        """Count the changes of `output` to the value that this topic had just commanded."""
         times = output.log_time_ns[output.changed]
         at = np.searchsorted(self.log_time_ns, times, "right") - 1
         age_s = (times - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
@@ -107,13 +108,13 @@ class CommandLog:
         return int((same & (at >= 0) & (age_s <= PASSED_WITHIN_S)).sum())
 
     def feeds(self, output: CommandLog, share: float) -> bool:
-        """Return whether `output` repeats this topic, at this share of its changes at least."""
+        """Return whether at least this share of the changes of `output` repeats this topic."""
         passed = self.passed_on(output)
         enough = passed >= max(MIN_PASSED, share * len(output.changed))
         return enough and passed > output.passed_on(self)
 
     def max_age_s(self) -> float:
-        """Return four of its median periods, between 0.2 and 1 s."""
+        """Return four times the median gap between commands, limited to 0.2 to 1 s."""
         gaps = np.diff(self.log_time_ns) * 1e-9
         return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
@@ -129,16 +130,16 @@ class CommandChoice:
 
 
 def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[Fit], CommandChoice]:
-    """Sort the topics that may drive, best first, and find the sources of the best one's commands.
+    """Put the topic that drives the robot first, and find the sources of its commands.
 
-    The best one is the last in a chain of multiplexers.
+    If multiplexers pass commands on from topic to topic, the last topic drives the robot.
     """
     logs = [CommandLog.read(recording, fit) for fit in fitting]
     reported = [one for one in logs if len(one.values)]
     if not reported:
         return list(fitting), CommandChoice(next(iter(logs), None))
     first = reported[0]
-    for _ in reported:  # down a chain of multiplexers
+    for _ in reported:  # follow a chain of multiplexers to its last output
         later = [one for one in reported if one is not first and first.feeds(one, HALF)]
         if not later:
             break
@@ -167,24 +168,24 @@ def _policy(topic: str) -> str:
     return parts[-1][:64] if parts else name
 
 
-MIN_GAP_S = 0.4  # shorter gaps show little
+MIN_GAP_S = 0.4  # gaps between commands that are shorter show little
 WITHIN_S = 0.5  # time over which the speed within a gap is measured
-MOVES = 0.25  # share of the commanded speed below which the robot stands
-STANDS_M, STANDS_RAD = 0.05, 0.2  # most that a standing robot moves in a gap
+MOVES = 0.25  # below this share of the commanded speed, the robot counts as standing
+STANDS_M, STANDS_RAD = 0.05, 0.2  # largest movement in a gap of a robot that stands
 MAX_S = 60.0
-MAX_GAP_S = 3600.0  # between two commands; if it is longer, log times are wrong
+MAX_GAP_S = 3600.0  # if a gap between two commands is longer, log times are wrong
 SETTLED_S = 1.0  # after commands have been fast for this long, latency and ramp are over
-NEARLY = 0.8  # share of the fastest command from which a command counts as fast
+NEARLY = 0.8  # a command of at least this share of the fastest one counts as fast
 MIN_SAMPLES = 10
-HELD_BACK = 0.67  # share of the command; a robot that stays below has reached its limit
+HELD_BACK = 0.67  # a robot that stays below this share of its command has reached its limit
 
 
 @dataclass(frozen=True)
 class CommandHold:
-    """Evidence of how long a robot goes on with a command, in log time."""
+    """Evidence of how long a robot keeps following a command, in log time."""
 
     age_s: float | None = None  # None: unknown
-    stops_hold: bool = False  # a command to stop holds until the next
+    stops_hold: bool = False  # whether the robot stands after a command to stop until the next one
     comments: tuple[str, ...] = ()
 
 
@@ -193,13 +194,13 @@ def command_hold(
 ) -> CommandHold:
     """Find how long commands (N,) hold, from the gaps between them.
 
-    `poses` are on the same clock, with the same zero.
+    `poses` are on the clock of `time_s`, with the same zero.
     """
     at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     if not len(time_s) or len(at) < 2:
         return CommandHold()
     turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
-    # Path length, as a robot that comes back to where it was has moved.
+    # Length of the path, not displacement: a robot that returns to its start has moved, too.
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)))])
     within = max(WITHIN_S, 3 * float(np.median(np.diff(at))))
     ends = np.append(time_s[1:], at[-1])
@@ -208,14 +209,14 @@ def command_hold(
         if not MIN_GAP_S <= end - begin <= MAX_GAP_S or at[0] > begin or at[-1] < end - within:
             continue
         if speed == 0 and turn == 0:
-            settled = min(begin + 1.0, end)  # it brakes first
+            settled = min(begin + 1.0, end)  # the robot brakes first
             moved = [float(np.ptp(np.interp([settled, end], at, c))) for c in (way, turned)]
             still = moved[0] <= STANDS_M and moved[1] <= STANDS_RAD
             stood, went = stood + still, went + (not still)
             continue
         moving = _followed_until(at, way, turned, begin, end, speed, turn, within)
         if moving is None:
-            continue  # it never started: it was blocked, or it is not this robot's command
+            continue  # the robot never moved: it was blocked, or the command is for another one
         if moving >= end - within / 2:
             on.append(end - begin)
         else:
@@ -233,7 +234,7 @@ def _followed_until(
     turn: float,
     within: float,
 ) -> float | None:
-    """Return the time in a gap until which the robot followed its command; None if never."""
+    """Return the time until which the robot followed its command in a gap; None if never."""
     checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
     checked = np.append(checked, end)
     since = np.maximum(checked - within, begin)
@@ -241,12 +242,12 @@ def _followed_until(
     gone = (np.interp(checked, at, way) - np.interp(since, at, way)) / span
     spun = (np.interp(checked, at, turned) - np.interp(since, at, turned)) / span
     drives = gone >= MOVES * abs(speed) if speed else spun * np.sign(turn) >= MOVES * abs(turn)
-    # Only times with new poses show whether it drives.
+    # Only times with a new pose show whether the robot drives.
     seen = np.searchsorted(at, checked, "right") > np.searchsorted(at, since, "left")
     moving = np.flatnonzero(drives & seen)
     if not len(moving):
         return None
-    # Up to the first break: later motion has another cause (a hand, another driver).
+    # Stop at the first break: later motion has another cause (a hand, another driver).
     broken = np.flatnonzero(~drives & seen & (checked > checked[moving[0]]))
     return float(checked[broken[0] - 1] if len(broken) else checked[moving[-1]])
 
@@ -266,7 +267,7 @@ def _hold_shown(on: list[float], stopped: list[float], stood: int, went: int) ->
 
 @dataclass(frozen=True)
 class CommandedDrive:
-    """The commands of a drive and its odometry, both as columns of m/s and rad/s."""
+    """The commands and the odometry of a drive; their columns are m/s and rad/s."""
 
     command_ns: Ints  # (N,) ascending
     command: F64  # (N, 2)
@@ -277,7 +278,7 @@ class CommandedDrive:
     def of(
         cls, recording: Recording, log: CommandLog, wheels: Sequence[Fit], wheelbase_m: float | None
     ) -> CommandedDrive:
-        """Read the odometry of a drive beside its commands."""
+        """Read the odometry of a drive, and combine it with the commands in `log`."""
         speed, turn = log.values.T
         if log.steered:
             turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
@@ -291,15 +292,15 @@ class CommandedDrive:
         return cls(log.log_time_ns, command, columns.log_time_ns, np.stack(measured, axis=1))
 
     def settled(self, axis: int, fastest: float) -> F64:
-        """Return the speeds measured on an axis (K,) once commands near `fastest` had settled.
+        """Return the measured speeds (K,) that the robot settled at under commands near `fastest`.
 
-        They are positive in the direction of the command. `fastest` is above 0.
+        Axis 0 is speed, axis 1 yaw rate. Values are positive in the command's direction.
         """
         reported, measured = self.command[:, axis], self.odometry[:, axis]
         if not len(reported):
             return np.zeros(0)
         fast = np.abs(reported) >= NEARLY * fastest
-        # The time since which commands have been fast in one direction, without a break.
+        # For each command: since when all commands have been fast, and in the same direction.
         breaks = (np.diff(fast) != 0) | (np.diff(np.sign(reported)) != 0)
         begins = np.where(np.append(True, breaks), np.arange(len(reported)), 0)
         since_ns = self.command_ns[np.maximum.accumulate(begins)]
@@ -307,16 +308,16 @@ class CommandedDrive:
         row = np.maximum(index, 0)
         settled = (index >= 0) & fast[row]
         settled &= (self.odometry_ns - since_ns[row]) * 1e-9 >= SETTLED_S
-        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # a recent command
+        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # command not old
         along = (measured * np.sign(reported[row]))[settled]
         return np.asarray(along[np.isfinite(along)], np.float64)
 
 
 def _limit(settled: F64, fastest: float) -> float | None:
-    """Return the limit that settled speeds (K,) show; None if the robot follows its commands.
+    """Return the robot's limit by its settled speeds (K,); None if it follows its commands.
 
-    Driving and turning share the wheels, so the fastest tenth is used, in which the other motion
-    needed least.
+    The limit is the 90th percentile: driving and turning share the wheels, so the robot is fastest
+    on one axis when it needs least for the other.
     """
     if len(settled) < MIN_SAMPLES:
         return None
@@ -325,7 +326,7 @@ def _limit(settled: F64, fastest: float) -> float | None:
 
 
 MOSTLY, RARELY = 98, 2  # percentiles of speeds; values beyond are outliers
-APART = 0.25  # share of the fastest command: a command this far from every action is far off
+APART = 0.25  # largest distance of a command to the nearest action, as a share of the top speed
 
 
 @dataclass(frozen=True)
@@ -335,13 +336,13 @@ class Commands:
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
     reverse_mps: tuple[float, ...] = ()  # slowest first; empty if it never backed up
-    still: bool = False  # all commands are to stand
+    still: bool = False  # whether all commands are 0
     count: int = 0
     topic: str = ""
-    measured: bool = False  # they are odometry, in place of commands
-    steered: bool = False  # they have the angle of the front wheels, as for a car
+    measured: bool = False  # whether odometry is used as commands
+    steered: bool = False  # whether commands contain the angle of the front wheels, as for a car
     wheelbase_m: float = 0.3
-    reached: tuple[float | None, float | None] = (None, None)  # limits (m/s, rad/s), if shown
+    reached: tuple[float | None, float | None] = (None, None)  # robot's limits, m/s, rad/s
 
     @classmethod
     def of(cls, drives: Sequence[CommandedDrive], **known: Any) -> Commands:
@@ -366,7 +367,7 @@ class Commands:
         )
 
     def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
-        """Set the fastest of these commands (N,), without outliers, which are not actions."""
+        """Set the speeds to the fastest of these commands (N,), ignoring outliers."""
         if not len(speed_mps):
             return self
         fast, sharp = (float(np.percentile(np.abs(c), MOSTLY)) for c in (speed_mps, yaw_rate_radps))
@@ -433,7 +434,7 @@ def turning_evidence(
 def _from_first_pose(
     times_ns: Ints, values: F64, poses: PoseSeries
 ) -> tuple[F64, F64, F64, PoseSeries]:
-    """Return the times (s) of commands, their two columns and poses, timed from the first pose."""
+    """Return command times (s), the two columns of commands, and poses; the first pose is at 0."""
     zero = poses.stamp_ns[0]
     since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
     return (times_ns - zero) * 1e-9, values[:, 0], values[:, 1], since

@@ -25,10 +25,10 @@ from restock.ingest.profile.description import (
     number,
 )
 
-MIN_M = 0.005  # of a wheel's radius
-MAX_ABOVE = 2  # moving joints between base and wheel, as of a suspension: more are an arm's
+MIN_M = 0.005  # smallest radius of a wheel
+MAX_ABOVE = 2  # moving joints between base and wheel (a suspension); an arm has more
 ENDLESS_RAD = 6 * np.pi  # a joint that may turn this far counts as endless
-DRIVES = {  # words in the names of links and of simulators' plugins
+DRIVES = {  # kind of drive -> words in names of links and of simulator plugins that show it
     "omnidirectional": ("mecanum", "omni_wheel", "omniwheel", "planar_move", "holonomic"),
     "ackermann": ("ackermann",),
     "skid_steer": ("skid_steer", "skidsteer"),
@@ -48,9 +48,9 @@ class DescribedRobot:
 class _Wheel:
     joint: Joint
     place: Place
-    radius_m: float  # NaN: its shape is a mesh, or it has none
+    radius_m: float  # NaN: its shape is a mesh, or it has no shape
     swivels: bool  # a joint above it turns about the vertical without a limit: a caster
-    steers: bool  # … within limits
+    steers: bool  # a joint above it turns about the vertical within limits
 
     @property
     def x_m(self) -> float:

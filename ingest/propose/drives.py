@@ -61,15 +61,15 @@ INSTEAD_OF_COMMANDS = (
 
 @dataclass(frozen=True)
 class Proposal:
-    """The TOML of a proposed profile, what needs a person, and its outcome on the recording."""
+    """The TOML of a proposed profile, what a person must check, and its result on the recording."""
 
     toml: str
-    base: Path  # the recording that it was proposed from, and tried on
-    missing: list[str] = field(default_factory=list)  # required inputs that nothing fills
-    signals: int = 0  # number of custom signals in it, all commented out
+    base: Path  # the recording that the profile was proposed from, and tried on
+    missing: list[str] = field(default_factory=list)  # required inputs that no topic fills
+    signals: int = 0  # number of custom signals in the TOML, all commented out
     ticks: int = 0
     transitions: int = 0
-    problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
+    problems: list[str] = field(default_factory=list)  # why the profile cannot be used yet
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
     # One dict per kind of robot, if there are several: `robot` in words and `recordings`. The
@@ -143,15 +143,15 @@ def _without_contradicted(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial
 
 
 def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
-    """Use one tick per period instead of one per command, if that pays.
+    """Use one tick per period instead of one per command, if that is better.
 
-    It does if it turns much more time into rows, or if commands come too unevenly for the twin
-    to follow.
+    It is better if it turns much more time into rows, or if commands come too unevenly for the
+    twin to follow.
     """
     clock = seen.clock
     if clock.steps != "command":
         return seen, trial
-    goalless = replace(seen, goal=GoalChoice(None))  # as pauses may also cost the drive its goals
+    goalless = replace(seen, goal=GoalChoice(None))  # pauses may also remove goals in hindsight
     now, other = try_evidence(goalless), try_evidence(replace(goalless, clock=clock.at_a_rate()))
     longer = other.seconds > GAIN * now.seconds
     evener = other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds
@@ -167,7 +167,7 @@ def _by_rate(seen: Evidence, trial: Trial) -> tuple[Evidence, Trial]:
 
 
 def try_evidence(seen: Evidence, recording: Recording | None = None) -> Trial:
-    """Try the profile that `seen` leads to on a recording, by default on its own."""
+    """Try the profile proposed from `seen` on a recording; default: the evidence's recording."""
     return try_toml(recording or seen.recording, "\n".join(profile_lines(seen, "robot")))
 
 
@@ -180,13 +180,13 @@ def try_toml(recording: Recording, toml: str) -> Trial:
         return Trial(problem=error.what)
 
 
-MAX_DRIVES = 12  # of one kind that a proposal reads
-MAX_NAMED = 5  # recordings that a list names
-MAX_BASES = 4  # drives whose evidence is tried on all drives
-# Worth of time with poses on a map, relative to time with odometry. If it were more, drives without
-# a map would be lost.
+MAX_DRIVES = 12  # largest number of drives that a proposal reads
+MAX_NAMED = 5  # largest number of recordings that a list names
+MAX_BASES = 4  # largest number of drives whose evidence is tried on all drives
+# A second with poses on a map counts as this many seconds with odometry. If it counted more, drives
+# without a map would be lost.
 LOCALISED_WORTH = 1.25
-SAME_PACE = 1.5  # ratio up to which the control periods of drives count as the same
+SAME_PACE = 1.5  # control periods count as the same up to this ratio
 
 
 @dataclass(frozen=True)
@@ -242,9 +242,8 @@ def propose_for_drives(
     Args:
         recordings: those in `drives.read`, in that order.
         drives: all recordings, grouped by kind.
-        name: of the profile.
+        name: the profile's name.
         given: what a person states about the robot.
-
     Raises:
         ConfigError: the URDF cannot be used.
     """
@@ -256,7 +255,7 @@ def propose_for_drives(
     usual = _trials(seen, evidence)
     giving = [one for one, trial in zip(evidence, usual, strict=True) if trial.transitions]
     if giving and not any(one.recording is seen.recording for one in giving):
-        seen = _choose_evidence(giving, evidence)  # the fullest drive stood still, or had no goal
+        seen = _choose_evidence(giving, evidence)  # the fullest drive may have stood still
         usual = _trials(seen, evidence)
     dropped: Counter[str] = sum((Counter(trial.dropped) for trial in usual), Counter())
     goal = seen.goal.after_trial(sum(trial.transitions for trial in usual), dropped)
@@ -286,7 +285,7 @@ def propose_for_drives(
 
 
 def _choose_evidence(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
-    """Return evidence with one of `bases`: the one that turns most time of all drives into rows."""
+    """Return the pooled evidence of the base that turns most time of all drives into rows."""
     return max(
         (pool_evidence(base, drives) for base in _bases(bases)),
         key=lambda one: (
@@ -309,10 +308,10 @@ def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     """Return the evidence of one drive, with the robot's properties combined from all drives."""
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max((base, *drives), key=lambda one: len(one.robot.values))
-    if base.commands.steered and not described.robot.described:  # keep to one wheelbase
+    if base.commands.steered and not described.robot.described:  # use one wheelbase for all
         described = base
-    # Prefer a measured outline to a guess, then one whose lidar is placed, then the smallest: a
-    # guess is from the nearest return.
+    # Prefer a measured outline to a guess, then an outline with a placed lidar, then the shortest
+    # one: guesses come from the nearest return, so all of them are upper bounds.
     outlined = min(
         (base, *drives),
         key=lambda one: (
@@ -328,7 +327,7 @@ def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         clock=replace(
             base.clock,
             command_age_s=max(one.clock.command_age_s for one in (base, *driven)),
-            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base may be at a rate
+            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base may use a rate
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
@@ -360,8 +359,8 @@ def _hold(drives: Sequence[CommandHold]) -> CommandHold:
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     """Return one drive per proposed clock and source of poses, the fullest first.
 
-    If some drives have far more frequent commands than others, one tick per command would be a
-    different time in each. Then there is one tick per period, the median of the drives' periods.
+    If some drives have far more frequent commands than others, one tick per command would last
+    differently long in each. Then ticks have a fixed period, the median of the drives' periods.
     """
     fullest = sorted(drives, key=_fullness, reverse=True)
     usable = [one for one in fullest if _fullness(one)[0] == _fullness(fullest[0])[0]]
@@ -382,7 +381,7 @@ def _at_rate(clock: ClockChoice, period_s: float, why: str) -> ClockChoice:
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:
-    """Return how many deciding inputs and inputs a drive has, and its duration (s)."""
+    """Return a drive's number of deciding inputs, number of all inputs, and duration (s)."""
     located = bool(one.roles["pose"]) or one.poses_from_frames
     deciding = sum((bool(one.roles["command"]), located, bool(one.roles["wheels"])))
     return deciding, sum(map(bool, one.roles.values())), one.recorded_s
@@ -419,7 +418,7 @@ def _advise_left_out(
     idle = [
         one.recording.path for one, t in zip(evidence, trials, strict=True) if not t.transitions
     ]
-    if idle and len(idle) < len(trials):  # if none gives any, `problems` has it
+    if idle and len(idle) < len(trials):  # all of them: see `problems`
         yield Advice(
             "name",
             f"{len(idle):,} of {len(trials):,} recordings give no transition: {names_of(idle)}",
@@ -430,11 +429,11 @@ def _advise_left_out(
         yield Advice("name", f"not of that kind: {others}: {kinds}; propose another profile for it")
 
 
-SCANS = 40  # first scans of a recording, which are used
-BEAMS = 0.1  # share by which scans of one lidar may differ in beams, as its speed may vary
+SCANS = 40  # number of scans that are read, from the start of a recording
+BEAMS = 0.1  # scans of one lidar may differ in beams by this share, as its speed may vary
 RANGE = 0.01
-SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are of a simulation, which begins at 0
-SHARED = 0.5  # share of all topics that recordings of one kind have in common
+SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are simulated: simulators start at 0
+SHARED = 0.5  # least share of topics that recordings of one kind must have in common
 
 
 @dataclass(frozen=True)
@@ -444,7 +443,7 @@ class Lidar:
     frame: str
     beams: int
     range_max_m: float  # 0: unknown
-    simulated: bool  # by their stamps
+    simulated: bool  # whether the stamps are a simulator's
 
     def agrees(self, other: Lidar) -> bool:
         return (
@@ -464,12 +463,12 @@ class RobotTraits:
     """The traits of a robot in one recording; None and "" if it does not show them."""
 
     command: str  # type of the topic that drives it
-    frames: str  # of its odometry: "odom -> base_link"
+    frames: str  # frames of its odometry, such as "odom -> base_link"
     lidar: Lidar | None
     description: str  # a digest of the description
     named: str  # the robot's name in the description
     inputs: frozenset[tuple[str, str]]  # topics, with their types, that command and locate it
-    topics: frozenset[tuple[str, str]]  # all of them
+    topics: frozenset[tuple[str, str]]  # all topics, with their types
 
     def fits(self, other: RobotTraits) -> bool:
         """Return whether both are of one kind: nothing differs, and something specific agrees."""

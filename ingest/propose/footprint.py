@@ -41,11 +41,11 @@ from restock.ingest.propose.roles import Kind, sharing_warning, sort_own_first
 from restock.ingest.steps.frames import Edges, PoseSeries, upward
 from restock.ingest.steps.needs import BEAMS, angle_keys, beam_angles
 
-OUTLINE = ("fixed", "continuous")  # joints of parts of the outline: not those of arms
-SIZES_M = (0.02, 30.0)  # smallest and largest plausible robot
+OUTLINE = ("fixed", "continuous")  # types of joint whose links count for the outline; arms do not
+SIZES_M = (0.02, 30.0)  # smallest and largest plausible length or width of a robot
 
 
-MIN_ASIDE_M = 0.05  # to the left or right of the middle
+MIN_ASIDE_M = 0.05  # a lidar this far left or right of the middle counts as aside
 DESCRIBED = "as described"  # source of a lidar's place
 
 
@@ -55,18 +55,18 @@ class Footprint:
 
     length_m: float
     width_m: float
-    source: str  # of the outline, in words
+    source: str  # where the outline is from, in words
     lidar_x_m: float | None = None  # ahead of the middle; None: unknown
     lidar_y_m: float = 0.0  # to the left
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
-    upside_down: bool = False  # the lidar
-    lidar_unplaced: str = ""  # the frame of its scans, if nothing gives its direction
-    measured: bool = True  # False: a guess
+    upside_down: bool = False  # whether the lidar is mounted upside down
+    lidar_unplaced: str = ""  # frame of the lidar's scans, if nothing gives its direction, else ""
+    measured: bool = True  # False: the outline is a guess
 
     @property
     def lidar_aside(self) -> bool:
-        """Return whether the lidar is so far aside that [inputs.scan] must give its place."""
+        """Return whether the lidar is so far off the middle that [inputs.scan] must say where."""
         return abs(self.lidar_y_m) > MIN_ASIDE_M
 
     @property
@@ -100,12 +100,12 @@ def parse_footprint(text: str) -> Footprint:
 
 @dataclass(frozen=True)
 class RobotText:
-    """A description of the robot, and where it is from."""
+    """The text of a robot description (URDF), and its source."""
 
     source: str  # a topic, or a file's name
     text: str
     kind: str = "robot_description"  # or "urdf"
-    check: str = ""  # why it may be of another robot
+    check: str = ""  # why the description may be another robot's; "": it is this robot's
 
     @cached_property
     def description(self) -> Description | str:
@@ -116,8 +116,8 @@ class RobotText:
 def descriptions(recording: Recording) -> Iterator[RobotText]:
     """Yield the last robot description of each topic that has one.
 
-    If the recording has several robots, those of the robot to propose for come first, then those
-    of no robot in particular.
+    If the recording has several robots, descriptions in the chosen robot's namespace come first,
+    then those in no robot's namespace.
     """
     for name in sort_own_first(recording, recording.topics):
         topic = recording.topics[name]
@@ -133,7 +133,7 @@ def descriptions(recording: Recording) -> Iterator[RobotText]:
 def footprint_of(
     texts: Iterable[RobotText], scan_frame: str = ""
 ) -> tuple[Footprint | None, list[str]]:
-    """Return the first footprint that a description has, and notes on the descriptions before."""
+    """Return the first plausible footprint; also return notes on the descriptions before it."""
     notes: list[str] = []
     for one in texts:
         found = of_urdf(one, scan_frame)
@@ -202,15 +202,15 @@ def _lidar(places: dict[str, Place], frame: str) -> tuple[tuple[float, float], f
     return ((x, y), yaw, bool(place.rotation[2, 2] < 0)) if np.isfinite([x, y, yaw]).all() else None
 
 
-BINS = 60  # of the full circle
+BINS = 60  # bins of bearing in the full circle
 NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field has a space in its name
 MIN_SCANS = 20
-OFTEN = 0.005  # share of scans, at least three, that must have a return as near
-TIGHT_PER_WIDTH = 0.3  # clearance as a share of the robot's width: less is a near collision
-MIN_M = 0.05  # least half length of a robot
+OFTEN = 0.005  # a nearest return counts if this share of scans (at least 3) has one as near
+TIGHT_PER_WIDTH = 0.3  # clearance below this share of the robot's width is a near collision
+MIN_M = 0.05  # smallest half length of a robot
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
-# To find own parts: the robot faced MIN_FACINGS directions, sectors of FACING_RAD, with
-# MIN_A_FACING scans in each; MOSTLY is the share of scans, and of directions, that must agree.
+# The robot's own parts are found if it faced MIN_FACINGS directions (sectors of FACING_RAD) during
+# MIN_A_FACING scans each. MOSTLY is the share of scans, and of directions, that must agree.
 FACING_RAD, MIN_FACINGS, MIN_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
 _LIMITS = ("range_min", "range_max")
 
@@ -228,7 +228,7 @@ class ScannedOutline:
         return float(np.hypot(*self.own_m.T).max(initial=0.0))
 
     def footprint(self, guess: Footprint) -> Footprint | None:
-        """Return the outline from these scans; None if it is the same as `guess`."""
+        """Return `guess`, corrected by these scans; None if they leave it the same."""
         half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(MIN_M, self.nearest_m))
         own = 2 * np.abs(self.own_m).max(axis=0, initial=0.0)
         length, width = (
@@ -246,9 +246,9 @@ class ScannedOutline:
 def scanned_outline(
     recording: Recording, fit: tuple[TopicInfo, Kind], poses: PoseSeries | None
 ) -> ScannedOutline | None:
-    """Bound the outline by a topic's scans; None if there are too few.
+    """Bound the outline by a topic's scans; None if there are too few scans.
 
-    Without poses, no own parts are found.
+    Without poses, the robot's own parts cannot be found.
     """
     topic, source = fit[0].name, Input(fit[0].name, fit[0].type, fit[1].fields)
     leaves = recording.leaves(topic)
@@ -271,7 +271,7 @@ def scanned_outline(
 
 
 def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
-    """Return at which bearings (BINS,) the range stays the same whichever way the robot faces."""
+    """Return the bearings (BINS,) of own parts: the range is the same wherever the robot faces."""
     facing = np.floor(yaw_rad / FACING_RAD).astype(np.int64)
     ways, counts = np.unique(facing, return_counts=True)
     ways = ways[counts >= MIN_A_FACING]
@@ -285,10 +285,7 @@ def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
 
 
 def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
-    """Return the nearest valid return of each scan in each bin of bearings (N, BINS).
-
-    A bin without a return is inf.
-    """
+    """Return the nearest valid range of each scan in each bin (N, BINS); inf without a return."""
     ranges = fields[source.fields["ranges_m"]]
     count = len(ranges)
     low, high = (
@@ -313,7 +310,7 @@ def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
     return {NEAREST: found}
 
 
-MAX_ASIDE_M = 3.0  # of a lidar from the middle
+MAX_ASIDE_M = 3.0  # a lidar farther from the middle is implausible
 MIN_RANGE_M = 0.01
 _TURN = 2 * math.pi
 
@@ -330,13 +327,13 @@ class SeenScans:
     ) -> tuple[float, float, int] | None:
         """Return the lowest and highest angle and the beams of the last scan, seen from above.
 
-        The angles are in a frame in which the lidar is turned by `yaw_rad`. None if the scan has no
-        angles, or implausible ones.
+        Angles are relative to the robot, on which the lidar is turned by `yaw_rad`. None if the
+        scan has no plausible angles.
         """
         if self.angles is None:
             return None
         sign = -1 if upside_down else 1
-        first, last, step = (sign * one + 0.0 for one in self.angles)  # no "-0.0" in a file
+        first, last, step = (sign * one + 0.0 for one in self.angles)  # avoid -0.0
         if not np.isfinite([first, last, step]).all() or abs(step) <= 1e-4:
             return None
         beams = round((last - first) / step) + 1
@@ -350,7 +347,7 @@ class SeenScans:
 
 
 def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
-    """Read the frame and angles of each topic's scans, of all topics in one pass."""
+    """Read the frame and angles of each topic's scans; all topics are read in one pass."""
     wanted, counted = dict[str, list[str]](), dict[str, Reduction]()
     for topic, kind in fits:
         leaves = set(recording.leaves(topic.name))
@@ -396,10 +393,10 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
 
 
 def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint:
-    """Add the lidar's place by the recording's last transforms, if it is plausible.
+    """Add the lidar's position and yaw from the recording's last transforms, if plausible.
 
-    The base frame is taken for the middle of the outline. That is wrong if the lidar would be
-    outside a measured outline: then only the lidar's yaw is used.
+    This assumes that the base frame is in the middle of the outline. If the lidar would then be
+    outside a measured outline, the assumption is wrong, and only the yaw is added.
     """
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     bases = [
@@ -429,9 +426,9 @@ def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
-    """Write the nearest and the farthest usable range, at most 4 m, as keys of [task].
+    """Write the smallest and largest usable range of the lidar (at most 4 m) as keys of [task].
 
-    The nearest excludes the 0 that some lidars give without a return, and the robot's own parts.
+    The smallest range excludes the robot's own parts, and the 0 of some lidars for "no return".
     """
     low, high, why = 0.05, 4.0, ""
     if set(_LIMITS) <= set(recording.leaves(topic)):

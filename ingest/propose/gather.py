@@ -61,7 +61,7 @@ from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # smallest and largest radius of a goal
-MIN_ROWS = 100  # with a goal in hindsight, if such goals are wanted
+MIN_ROWS = 100  # least rows with a goal in hindsight for which wanted goals are kept
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class GoalChoice:
     """The goal of a proposal; `source` None: the task has none."""
 
     source: GoalSource | None
-    why: str = ""  # why there is none
-    hindsight_wanted: bool = False  # even if most of the drive has no goal in hindsight
+    why: str = ""  # why the task has no goal
+    hindsight_wanted: bool = False  # keep hindsight even if it finds no goal for most of the drive
 
     def after_trial(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
         """Return the choice after a trial.
@@ -107,9 +107,9 @@ class GoalChoice:
         return ["[goal]  # no goal and plan seen", f'source = "hindsight"  # {why}', ""]
 
 
-# input -> the field that a topic must measure to be of use for it
+# input -> the field that a topic must measure to fill the input
 MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}
-MILLIMETRES_UP_TO_M = 1e4  # up to here, float32 has a resolution of about a millimetre
+MILLIMETRES_UP_TO_M = 1e4  # up to this distance, float32 resolves about 1 mm
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ class Evidence:
 
     recording: Recording
     roles: Roles
-    frames: Frames | None  # the fixed and base frames that transforms join
+    frames: Frames | None  # the fixed frame and the base frame, if transforms connect them
     poses_from_frames: bool
-    motion: MotionChoice | None  # if no topic has the wheels' speeds
+    motion: MotionChoice | None  # how speeds follow from poses, if no topic has wheel speeds
     commands: Commands
     chosen: CommandChoice
     driven: CommandedDrive | None
@@ -130,12 +130,12 @@ class Evidence:
     gaps: Gaps
     footprint: Footprint
     footprint_notes: list[str]
-    outline: ScannedOutline | None  # if it has enough scans
+    outline: ScannedOutline | None  # None: too few scans
     goal: GoalChoice
     signals: list[Candidate]
     robot: RobotProposal
-    unmeasured: dict[str, str]  # input -> topics that have no estimate of it, or ""
-    origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
+    unmeasured: dict[str, str]  # input -> why topics were not used for it, or ""
+    origin_m: tuple[int, int] | None  # point subtracted from positions, if poses are far from 0
 
     @property
     def recorded_s(self) -> float:
@@ -148,10 +148,10 @@ class Evidence:
 class Given:
     """What a person states about a robot, besides its recordings."""
 
-    footprint: Footprint | None = None  # its outline; None: from the recording
+    footprint: Footprint | None = None  # the robot's outline; None: read it from the recording
     urdf: Path | None = None  # a file that replaces the recording's description
     odometry_as_command: bool = False  # use the measured motion if commands are missing
-    # Use goals in hindsight even if most of the drive has none, whose rows are then left out.
+    # Use goals in hindsight even if most of the drive has none; rows without a goal are left out.
     hindsight_goals: bool = False
 
 
@@ -179,8 +179,8 @@ def gather(recording: Recording, given: Given) -> Evidence:
     edges = transform_edges(recording)
     frames = transform_frames(recording, edges)
     if frames is not None and all(kind.by_fix for _, kind in roles["pose"]):
-        roles["pose"] = []  # transforms also give its heading
-    # Odometry drifts: transforms that lead to a map are the better pose.
+        roles["pose"] = []  # unlike satellite fixes, transforms give the heading
+    # If the only poses are odometry, which drifts, transforms to a map frame are better.
     drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
     framed = frames is not None and (on_map(frames) or not roles["pose"]) and drifts
     poses, poses_from = None, ""
@@ -266,9 +266,9 @@ def gather(recording: Recording, given: Given) -> Evidence:
 
 
 def _origin_m(poses: PoseSeries) -> tuple[int, int] | None:
-    """Return the middle of poses that are far from 0; None if they are near.
+    """Return the median position (m), rounded, if it is far from 0; None if it is near.
 
-    A store keeps positions in float32, which would round far ones to more than a millimetre.
+    A store has positions in float32, which would round far positions to more than a millimetre.
     """
     x, y = (float(np.median(column)) if len(poses) else 0.0 for column in (poses.x_m, poses.y_m))
     return (round(x), round(y)) if max(abs(x), abs(y)) > MILLIMETRES_UP_TO_M else None
@@ -277,10 +277,7 @@ def _origin_m(poses: PoseSeries) -> tuple[int, int] | None:
 def _measured(
     recording: Recording, fits: list[tuple[TopicInfo, Kind]], key: str
 ) -> tuple[list[tuple[TopicInfo, Kind]], str]:
-    """Drop the topics of an input before the first that measures `key`.
-
-    Also return why they were dropped.
-    """
+    """Drop an input's topics before the first that measures `key`; also return the reasons."""
     reasons: list[str] = []
     for place, (topic, kind) in enumerate(fits):
         leaves = set(recording.leaves(topic.name))
@@ -303,8 +300,8 @@ def _measured(
 def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
     """Drop the first topic of an input; `why` goes into the profile.
 
-    The next topic takes its place or, for wheels, the poses do. Returns None if there are too few
-    poses.
+    The input's next topic replaces it. If wheels have no next topic, speeds are computed from
+    poses; returns None if there are too few poses.
     """
     roles = {**seen.roles, role: seen.roles[role][1:]}
     reasons = "; ".join(filter(None, [seen.unmeasured.get(role, ""), why]))
@@ -325,7 +322,7 @@ def _paces(recording: Recording, names: Collection[str]) -> dict[str, float]:
     for name, columns in recording.read({name: [] for name in sorted(names)}).items():
         gaps = columns.gaps_s()
         if len(gaps) > 1:
-            # The median, or half the 90th percentile if messages come in bursts.
+            # Use the median gap, or half the 90th percentile if messages come in bursts.
             found[name] = max(float(np.median(gaps)), float(np.percentile(gaps, 90)) / 2)
     return found
 
@@ -333,7 +330,7 @@ def _paces(recording: Recording, names: Collection[str]) -> dict[str, float]:
 def _slowest_s(
     paces: Mapping[str, float], used: Mapping[str, str], poses: PoseSeries | None
 ) -> float:
-    """Return the time between two messages of pose or wheels, whichever come less often."""
+    """Return the time (s) between messages of pose or of wheels, whichever is longer."""
     names = [used[role] for role in ("pose", "wheels") if role in used]
     known = [paces[name] for name in names if name in paces]
     if poses is not None and len(poses) > 1 and not names:

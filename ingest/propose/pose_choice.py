@@ -59,8 +59,8 @@ def frame_lines(frames: Frames, *, used: bool) -> list[str]:
 def transform_topics(recording: Recording) -> tuple[str, str]:
     """Return the topics of the robot's moving and static transforms.
 
-    They are those in its own namespace, or else `/tf` and `/tf_static`, or else those in the only
-    namespace that has any, or else the only topic with Foxglove's transforms.
+    The first of these that exist are used: topics in the robot's namespace; `/tf` and `/tf_static`;
+    topics in the only namespace with transforms; the only topic with Foxglove's transforms.
     """
     names = Frames().topic, Frames().static_topic
     held = {
@@ -109,13 +109,13 @@ def mount_of(edges: Edges, sensor: str, base: str) -> tuple[F64, F64] | None:
 
 
 def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
-    """Return the names in `edges.topics` of the transforms from a frame up to another, or []."""
+    """Return the keys in `edges.topics` of the transforms from `base` up to `fixed`, or []."""
     chain, here = list[str](), plain(base)
     while here != plain(fixed):
         names = [name for name in edges.topics if name.split(" ", 1)[1] == here]
         if not names or len(chain) > len(edges.topics):
             return []
-        # A frame may be sent both as static and as moving: the moving transform is right.
+        # If a frame is sent both as static and as moving, use the moving transform.
         name = min(names, key=lambda name: (name in edges.static, -len(edges.topics[name])))
         chain.append(name)
         here = str(np.asarray(edges.topics[name].fields[PARENT], object)[-1])
@@ -143,8 +143,8 @@ def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
     return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
 
 
-SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # largest standard deviations of speeds
-MIN_S, MAX_S = 0.2, 2.0  # of the window
+SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # acceptable standard deviations of computed speeds
+MIN_S, MAX_S = 0.2, 2.0  # limits of the window over which speeds are computed from poses
 MIN_POSES = 3
 MIN_CHANGES = 20
 
@@ -163,7 +163,7 @@ class MotionChoice:
 
 
 def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> MotionChoice:
-    """Choose the window in which speeds follow from poses; `source` names where they are from."""
+    """Choose the window in which speeds are computed from poses; `source` names the poses."""
     gaps = np.diff(poses.stamp_ns) * 1e-9
     period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
     least = (MIN_POSES - 1) * usual * 1.1
@@ -192,7 +192,7 @@ def pose_series(
 ) -> tuple[PoseSeries, str]:
     """Return every pose at its log time, and its source in words.
 
-    Poses are those of `frames` by the transforms `edges`, or without `frames` those of the topic.
+    They come from the transforms `edges` between `frames`; without `frames`, from the pose topic.
     """
     if frames is not None:
         edges = edges.only({frames.base, frames.fixed})
@@ -238,7 +238,10 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
 def fix_noise_lines(
     recording: Recording, topic: str, fields: Mapping[str, str], driven_m: float
 ) -> list[str]:
-    """Write the limits of jumps and slip, if the robot drives `driven_m` between two fixes."""
+    """Write the limit of pose jumps and the noise of poses from satellite fixes.
+
+    `driven_m` is how far the robot drives between two fixes.
+    """
     usual = _usual_std_m(fixes_in(recording, topic, fields)) or 1.0
     return [
         "[episodes]",
@@ -251,14 +254,14 @@ def fix_noise_lines(
 
 
 def _usual_std_m(fixes: Fixes) -> float | None:
-    """Return the median standard deviation of fixes; None if they give none."""
+    """Return the median of the standard deviations that fixes contain (m); None without any."""
     std_m = fixes.std_m()
     reported = std_m[np.isfinite(std_m)]
     return float(np.median(reported)) if len(reported) else None
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:
-    """Keep the poses that differ from the one before, if these are enough to show the noise."""
+    """Drop poses that repeat the pose before, if enough others remain to show the noise."""
     columns = (poses.x_m, poses.y_m, poses.yaw_rad)
     new = np.concatenate([[True], np.any([np.diff(column) != 0 for column in columns], axis=0)])
     if new.sum() < MIN_CHANGES:

@@ -50,7 +50,7 @@ def profile_lines(
 ) -> list[str]:
     """Write the TOML of a profile, with each piece of `advice` as a comment at its table.
 
-    `problems` are the reasons why it cannot be used; `trial` is its outcome on the recording.
+    `problems` are reasons why the profile cannot be used, `trial` its outcome on the recording.
     """
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
@@ -100,7 +100,7 @@ def profile_lines(
         ]
     for signal in seen.signals:
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
-    # Topics are named by strangers: a line break in a name must not start a key.
+    # Names of topics are untrusted: a line break in a name must not start a new key.
     return [visible(line) for line in lines]
 
 
@@ -275,7 +275,7 @@ def _topic_lines(seen: Evidence) -> list[str]:
 
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
     """Write the noise of the robot's poses, if that is more than a profile's default."""
-    fixes = next(iter(seen.roles["pose"]), None)  # its pose's topic
+    fixes = next(iter(seen.roles["pose"]), None)  # the topic used for poses
     if fixes is None or not fixes[1].by_fix:
         noise_m = trial.pose_noise_m
         slip = "wheel_slip" in _conditions(seen)[0]
@@ -308,7 +308,7 @@ def _clock_lines(clock: ClockChoice) -> list[str]:
 
 
 def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
-    """Return four periods of a topic; None (latched) if it has few messages."""
+    """Return four times a topic's mean period (s); None (latched) if it has few messages."""
     rate = topic.expected / seconds if seconds > 0 else 0.0
     if topic.expected < 3 or rate < 0.05:
         return None
@@ -316,7 +316,7 @@ def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
 
 
 def _unfilled_lines(role: str, seen: Evidence) -> list[str]:
-    """Write the table of an input that nothing fills, in comments."""
+    """Write the table of an input that no topic fills, in comments."""
     if role in REQUIRED:
         fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
         transforms = ", nor transforms that join two frames" if role == "pose" else ""
@@ -392,11 +392,11 @@ def _input_lines(role: str, fits: Sequence[tuple[TopicInfo, Kind]], seen: Eviden
     return [*lines, "optional = true"] if role in FALLBACKS else lines
 
 
-GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
-ROUTE_M = 20.0  # that the robot must be able to drive within the time limit
+GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # fastest curve that is careful on ice
+ROUTE_M = 20.0  # length of a route that the robot must be able to drive within the time limit
 MAX_TIME_LIMIT_STEPS = 1000
-MOSTLY_FREE = 0.1  # largest share of messages in which a bumper is pressed
-MIN_TIGHT_M = 0.05  # less is within a lidar's noise
+MOSTLY_FREE = 0.1  # a topic that is "pressed" in a larger share of messages is no bumper
+MIN_TIGHT_M = 0.05  # smallest tight clearance: less is within a lidar's noise
 
 
 def task_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
@@ -456,16 +456,16 @@ def actions_of(commands: Commands, robot: RobotProposal) -> list[tuple[float, fl
         return _steered_actions(commands, robot)
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
-    if 0.8 * speed > GENTLE_MPS:  # on a slippery floor it also needs a slower curve
+    if 0.8 * speed > GENTLE_MPS:  # add a slower curve for slippery floors
         slow, bend = min(0.35 * speed, GENTLE_MPS), min(0.5 * turn, GENTLE_RADPS)
         actions += [(slow, bend), (slow, -bend)]
     return actions + [(-back, 0.0) for back in commands.reverse_mps]
 
 
 def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
-    """Return actions that a robot that steers can drive.
+    """Return actions for a robot that steers like a car.
 
-    None turns on the spot, or tighter than its steering allows.
+    No action turns on the spot, or in a tighter curve than the steering allows.
     """
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
     known = {key: robot.values[key] for key in ("max_steering_rad",) if key in robot.values}
@@ -495,7 +495,7 @@ def _bump_line(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> 
 
 
 def _body_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
-    """Write the outline, and the tight clearance of a robot that is too narrow for the default."""
+    """Write the outline; also the tight clearance if the robot is too narrow for the default."""
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     aside = bool(seen.roles["scan"]) and footprint.lidar_aside

@@ -24,27 +24,30 @@ from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.task.task import wrap_angle
 from restock.toml import toml_value
 
-SETTLED_S = 1.0  # longest time that a command holds
-ANSWERED_S = 0.5  # a turn up to this long after a command still answers it
-# Commands to turn on the spot: most speed, least share of the sharpest turn, least yaw rate.
+SETTLED_S = 1.0  # longest time that a command counts
+ANSWERED_S = 0.5  # a turn counts as an answer up to this long after the command ended
+# A command to turn on the spot has at most this speed, and at least this share of the sharpest yaw
+# rate and TURNS_RADPS.
 STANDS_MPS, MUCH = 0.02, 0.3
 TURNS_RADPS = 0.15
-MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # such commands needed; share to follow
-MIN_MOVED_M = 0.05  # else it may not have been able to move
+# Evidence needed: total angle and number of such turns commanded. A robot that turned FOLLOWS of
+# the angle can turn on the spot.
+MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15
+MIN_MOVED_M = 0.05  # a robot that moved less may have been unable to move
 
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """How a robot followed commands to turn on the spot, which no car can."""
+    """How a robot followed commands to turn on the spot; a car cannot follow them."""
 
     moved_m: float = 0.0  # diagonal of the area it drove in
-    requested_rad: float = 0.0  # by commands to turn on the spot
-    spells: int = 0  # of such commands
-    followed_rad: float = 0.0  # turned in the direction of such commands
+    requested_rad: float = 0.0  # total angle of the commands to turn on the spot
+    spells: int = 0  # number of uninterrupted turns on the spot that were commanded
+    followed_rad: float = 0.0  # total angle turned in the commanded direction
 
     @property
     def steers(self) -> bool:
-        """Return whether it did not turn on the spot when commanded to, although it can move."""
+        """Return whether the robot moved, but did not turn on the spot when commanded to."""
         reported = self.requested_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         followed = self.followed_rad >= FOLLOWS * self.requested_rad
         return reported and self.moved_m >= MIN_MOVED_M and not followed
@@ -67,7 +70,7 @@ def drive_evidence(
 
     Args:
         command_s, command_mps, command_radps: the commands (N,), in order, on the clock of `poses`.
-        poses: of the robot, with the same zero of time.
+        poses: the robot's poses, with the same zero of time.
     """
     if len(command_s) < 2 or len(poses) < 3:
         return DriveEvidence()
@@ -82,7 +85,7 @@ def drive_evidence(
 def _on_the_spot(
     command_s: F64, command_mps: F64, command_radps: F64, at_s: F64, heading: F64
 ) -> tuple[float, int, float]:
-    """Return how far (rad) and how often it was to turn on the spot, and how far it turned."""
+    """Return the angle (rad) and number of commanded turns on the spot, and the angle turned."""
     sharp = float(np.percentile(np.abs(command_radps), 98))
     side = np.sign(command_radps) * (
         (np.abs(command_mps) <= STANDS_MPS)
@@ -102,9 +105,9 @@ def _on_the_spot(
     return requested, spells, followed
 
 
-WHEELBASE_PART = 0.6  # of the outline's length, if nothing shows it
+WHEELBASE_PART = 0.6  # guess for an unknown wheelbase, as a share of the outline's length
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
-MAX_BEAMS = 361  # in the twin, as each costs time; of a finer lidar every k-th beam is used
+MAX_BEAMS = 361  # beams cost time in the twin; of a lidar with more, every k-th beam is used
 
 
 @dataclass(frozen=True)
@@ -114,28 +117,28 @@ class RobotProposal:
     values: dict[str, Any] = field(default_factory=dict)
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    rolls: bool = True  # False: by its description it has no wheels
+    rolls: bool = True  # False: the description shows no wheels
     drive_why: str = "A GUESS: the recording does not show it"
 
     @property
     def described(self) -> bool:
-        """Return whether a description gives its drive."""
+        """Return whether the robot's drive is from a description."""
         return "drive" in self.values and self.origin.get("drive") != "logs"
 
     @property
     def guessed_steering(self) -> bool:
-        """Return whether it is taken for a car only because of how it drove."""
+        """Return whether only the logs, not a description, suggest that it steers like a car."""
         return self.values.get("drive") == "ackermann" and not self.described
 
     def driven(
         self, shown: DriveEvidence, length_m: float, *, command_rad: float | None = None
     ) -> RobotProposal:
-        """Add the drive that its logs show, if no description gives one.
+        """Add the kind of drive that the logs show, if no description gives one.
 
         Args:
-            shown: how it turned.
-            length_m: of its outline, from which the wheelbase is guessed.
-            command_rad: the sharpest of its commands, if they are steering angles.
+            shown: how the robot turned.
+            length_m: length of its outline, from which the wheelbase is guessed.
+            command_rad: the sharpest command, if commands are steering angles.
         """
         if self.described:
             return self
@@ -155,7 +158,7 @@ class RobotProposal:
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
-        """Add the limits that its logs show."""
+        """Add the speed limits that the logs show; None: no limit."""
         logged = {"max_speed_mps": speed_mps, "max_yaw_rate_radps": yaw_rate_radps}
         found = {key: value for key, value in logged.items() if value is not None}
         origin = self.origin | dict.fromkeys(found, "logs")
@@ -214,13 +217,13 @@ def propose_robot(
     upside_down: bool = False,
     lidar_yaw_rad: float = 0.0,
 ) -> RobotProposal:
-    """Return the robot by the first description of a wheeled robot, and by its scans.
+    """Return the robot by the first description that has wheels, and by the robot's scans.
 
     Args:
         texts: the descriptions.
-        scan: the frame and angles of its scans.
+        scan: the frame and angles of the robot's scans.
         upside_down: whether the lidar hangs upside down.
-        lidar_yaw_rad: yaw at which the twin's lidar, in the middle, covers the same directions.
+        lidar_yaw_rad: yaw with which a lidar in the robot's middle covers the same directions.
     """
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
@@ -235,7 +238,7 @@ def propose_robot(
         middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
         found = described_robot(description, middle, scan.frame if scan is not None else "")
         if found.problem is not None:
-            unfit.append(f"{one.source}: {found.problem}")  # perhaps an arm's
+            unfit.append(f"{one.source}: {found.problem}")  # perhaps an arm
             continue
         if one.check:
             notes.append(f"{one.source}: {one.check}")

@@ -26,7 +26,7 @@ def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Kind:
-    """A message type that may fill an input, and its fields."""
+    """A message type that may fill an input, with its fields and rules for names of topics."""
 
     type: str
     fields: dict[str, str]
@@ -34,11 +34,11 @@ class Kind:
     must: bool = False  # require one of `words`
     never: tuple[str, ...] = ()  # words in a topic's name that exclude it
     rather: tuple[str, ...] = ()  # words in a topic's name that put it last
-    at_changes: bool = False  # messages come when something changes, and hold until then
+    at_changes: bool = False  # messages come only at changes; each is valid until the next
 
     @property
     def by_fix(self) -> bool:
-        """Return whether it is a position by latitude and longitude."""
+        """Return whether this kind is a position by latitude and longitude."""
         return "latitude_deg" in self.fields
 
 
@@ -53,7 +53,7 @@ _STATED_FIX = {
 _FIX = {key: path for key, path in _STATED_FIX.items() if key != "status"}
 _RECEIVERS = ("fix", "gps", "gnss")
 
-# Names of commands that are only proposed: to a multiplexer, a smoother or a person's remote.
+# Words in names of commands that navigation sends to a multiplexer, a smoother or a remote.
 NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
 # Names of commands, the nearest to the motors first: a multiplexer's output before its inputs.
 _DRIVEN = ("cmd_vel_out", "mux/out", "mux/cmd_vel", "cmd_vel")
@@ -81,7 +81,7 @@ _MEASURED = (
     ),
 )
 
-MUCH = 0.1  # share of the chosen topic's messages from which another topic may be right
+MUCH = 0.1  # another topic may be the right one if it has this share of the chosen one's messages
 
 _TWISTS = (
     ("geometry_msgs/msg/Twist", _TWIST),
@@ -121,7 +121,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             for name in _POSES
         ),
         *(Kind(name, _under(at, _POSE), ("filtered", "map", "odom")) for name, at in _ODOMETRY),
-        # From motion capture and the like, whatever the topic's name.
+        # Poses from motion capture and similar systems, whatever the topic's name.
         *(Kind(name, _under("pose", _POSE), never=_ELSEWHERE) for name in _POSES),
         Kind(
             "geometry_msgs/msg/TransformStamped",
@@ -201,7 +201,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 }
 # Used on request: the measured motion in place of commands that were not recorded.
 ODOMETRY_AS_COMMAND = _MEASURED
-# Message type -> the input that shows it to be of a robot. Odometry may also fill the pose.
+# Message type -> the input that it fills, by which a robot's namespace is recognised.
 _KIND_OF = {
     name: role
     for role in ("pose", "imu", "scan", "plan", "wheels", "command")
@@ -211,9 +211,9 @@ _KIND_OF = {
 _OTHER_ENCODINGS = ("json", "protobuf")
 REQUIRED = ("command", "pose")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
-# Topics of Restock's own node: what a policy would have driven is not a command of the robot.
+# Topics of Restock's own node. Actions that a policy only proposed are no commands of the robot.
 NODE_TOPICS = frozenset((PROPOSAL, SHADOW, ACTION, LIMITER, TAKEOVER))
-SPENT = (*LATCHED, "true_condition", "true_exposure")  # topics without any other use
+SPENT = (*LATCHED, "true_condition", "true_exposure")  # inputs whose topics have no other use
 
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> topics that may fill it, best first
 
@@ -230,11 +230,11 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
 def robots_in(recording: Recording) -> list[str]:
     """Return the namespaces of a recording's robots, if it has several.
 
-    The robot to propose for is first: the chosen one, or one with a command and topics of most
-    kinds.
+    The robot to propose for is first: the chosen robot, or else a robot with a command and with
+    topics of the most kinds.
 
-    Namespaces are robots' if they are siblings in which topics of at least two kinds have the same
-    names. `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one robot.
+    Sibling namespaces are robots if topics of at least two kinds have the same names in them.
+    `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, belong to one robot.
     """
     kinds, messages = defaultdict[str, set[str]](set), Counter[str]()
     beside = defaultdict[tuple[str, str, str], set[str]](set)  # by parent, rest and kind
@@ -257,7 +257,7 @@ def robots_in(recording: Recording) -> list[str]:
         key=lambda one: (
             one != recording.robot,
             "command" not in kinds[one],
-            -len(kinds[one] - {"imu"}),  # an IMU is not needed
+            -len(kinds[one] - {"imu"}),  # an IMU does not count
             -messages[one],
             one,
         ),
@@ -265,7 +265,7 @@ def robots_in(recording: Recording) -> list[str]:
 
 
 def choose_robot(recording: Recording, name: str) -> None:
-    """Choose the robot with this namespace, of several in the recording, to propose for.
+    """Choose the robot to propose for by its namespace, if the recording has several robots.
 
     Raises:
         ConfigError: there is no such robot, or no topic in this namespace.
@@ -305,11 +305,11 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
 
 
 def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
-    """Return whether a topic's messages are of this type.
+    """Return whether a topic's messages are of this kind.
 
-    In JSON and protobuf, ROS's types may be in any namespace (`ros.geometry_msgs.Twist`, `Twist`),
-    so the fields are checked as well. So are bumpers' fields, as no distribution defines their
-    packages.
+    In JSON and protobuf, ROS types may be in any namespace (`ros.geometry_msgs.Twist`, `Twist`), so
+    fields are checked as well. The fields of bumpers are also checked, because no ROS distribution
+    defines the packages of their types.
     """
     other = topic.encoding in _OTHER_ENCODINGS
     of_ros = "/" in kind.type and last_part(topic.type) == last_part(kind.type)
@@ -326,7 +326,7 @@ MAX_FLAGS = 8
 
 
 def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
-    """Return bumpers with a type of the robot's own: a bumper by name, with flags only."""
+    """Return bumpers of unknown types: topics named like a bumper, with only flags as fields."""
     found = []
     for topic in usable_topics(recording).values():
         leaves = [one for one in recording.fields(topic.name) if not one.path.startswith("header.")]
@@ -340,8 +340,8 @@ def own_bumpers(recording: Recording) -> list[tuple[TopicInfo, Kind]]:
 def topics_for(recording: Recording, kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
     """Sort the topics that may fill an input, best first.
 
-    The robot's own topics come before those of no robot. Within these, topics with a word of
-    `rather` are last, and the rest is by kind, by word and by number of messages.
+    Topics in the robot's namespace come before those in no robot's namespace. Within each group,
+    topics with a word of `rather` are last; the others are sorted by kind, word and messages.
     """
     own = tuple(f"{robot}/" for robot in robots_in(recording)[:1])
     topics, fitting = usable_topics(recording).values(), []

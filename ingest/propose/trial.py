@@ -19,16 +19,16 @@ from restock.ingest.steps.episodes import Split, Steps, explain_no_transitions, 
 from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
 
-MUCH = 0.1  # share of ticks: a choice that costs as many is reported
-GAIN = 1.1  # factor of transitions: a choice that gives as many more is worth a try
-OFTEN_NEAR = 0.4  # share of ticks: if it is exceeded, the outline is probably wrong
+MUCH = 0.1  # a choice that costs at least this share of the ticks is reported
+GAIN = 1.1  # a choice that multiplies the transitions by more than this is suggested
+OFTEN_NEAR = 0.4  # if things are near in a larger share of ticks, the outline is probably wrong
 OFTEN_INSIDE = 0.02
-MOVING, MIN_MOVING = 0.2, 30  # share of the fastest action's speed; ticks
-SLIP_OVER = "{0.2 m}"  # of driving, as in wheel_slip and slippery_floor
-NOISE_IN_LIMIT = 1.25  # margin: slip is more than twice the noise
+MOVING, MIN_MOVING = 0.2, 30  # share of top speed above which a robot moves; ticks needed with it
+SLIP_OVER = "{0.2 m}"  # window of driving over which slip is measured, as in wheel_slip
+NOISE_IN_LIMIT = 1.25  # the limit of slip is this multiple of twice the noise
 EVEN_S = 3.0  # same length as the segments used to compare twin and log
-EVEN = 0.25  # share of a control period by which an even tick may be off
-UNEVEN = 4.0  # factor of time that the twin can follow from which one tick per period is better
+EVEN = 0.25  # largest deviation of an even tick, as a share of a control period
+UNEVEN = 4.0  # ticks per period are better if the twin can follow them this many times longer
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,18 @@ class Trial:
 
     ticks: int = 0
     transitions: int = 0
-    seconds: float = 0.0  # that the transitions span
-    even_s: float = 0.0  # of them, in stretches that a simulator can follow tick by tick
+    seconds: float = 0.0  # time that the transitions span
+    even_s: float = 0.0  # part of `seconds` that a simulator can follow tick by tick
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> ticks in no episode
     advice: list[Advice] = field(default_factory=list)
     problem: str = ""  # why there are no transitions
     findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
-    pose_noise_m: float | None = None  # of poses against wheels, over a control period
+    pose_noise_m: float | None = None  # noise of poses relative to wheels, over a control period
     inside_outline: float | None = None  # share of usable ticks with a return inside the robot
 
 
 def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
-    """Try a profile on the columns that `read_topics` reads for it from a recording."""
+    """Try a profile on a recording; `topics` are the columns that `read_topics` returns for it."""
     try:
         steps = steps_of(profile, topics)
     except RecordingError as error:
@@ -93,8 +93,8 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
 def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     """Return the noise of poses over a control period; None if the robot hardly moved.
 
-    The limits of slip follow from it: they should be well above the difference of poses and wheels
-    over a window, at nine in ten of the ticks at which either moved.
+    Limits of slip are computed from this noise. They should be well above the difference between
+    poses and wheels over a window of SLIP_OVER, at 90 % of the ticks at which either moved.
     """
     limits = task.condition_limits
     window = int(in_steps(SLIP_OVER, limits)) + 1
@@ -112,10 +112,10 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:
-    """Return the time of an episode's ticks (N,) that is in even segments of about 3 s.
+    """Return how much time (s) of an episode's ticks (N,) is in even segments of about 3 s.
 
-    In an even segment, each tick is within a quarter of a period of when it is due, as for the
-    segments by which the twin is calibrated and compared.
+    In an even segment, each tick is within a quarter of a period of its due time. The twin is
+    calibrated and compared on such segments.
     """
     ticks, even_s, at = max(round(EVEN_S / period_s), 1), 0.0, 0
     off_s = (stamp_ns - stamp_ns[0]) / NS - np.arange(len(stamp_ns)) * period_s
@@ -129,7 +129,7 @@ def _even_s(stamp_ns: Ints, period_s: float) -> float:
 def _ages(
     profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
 ) -> Iterator[Advice]:
-    """Yield advice on inputs that are often stale: their age, and the outcome if latched."""
+    """Yield advice on inputs that are often stale: how old they get, and the result if latched."""
     for name, source in profile.inputs.items():
         count = episodes.dropped.get(f"{name}: stale", 0)
         if source.max_age_s is None or count < MUCH * len(steps):
@@ -155,9 +155,9 @@ def _ages(
 def _outline(
     profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps
 ) -> tuple[float | None, list[Advice]]:
-    """Return the share of usable ticks at which the lidar sees something inside the robot.
+    """Return the share of usable ticks at which the lidar sees something inside the outline.
 
-    Also return advice on that, and on things that almost touch the robot.
+    Also return advice on such returns, and on returns that are very near the outline.
     """
     scan, body = profile.inputs.scan, profile.task.body
     usable = np.array([problem == "" for problem in steps.problem], np.bool_)
