@@ -66,7 +66,7 @@ FIRST_SEED = 10_000
 
 
 def wrong_seed(seed: int, count: int = 1) -> str | None:
-    """Explain what is wrong with a seed, or with `count` seeds from it on; None if valid."""
+    """Explain why the `count` seeds from `seed` on are not all valid; None if they are."""
     if 0 <= seed <= LAST_SEED + 1 - count:
         return None
     last = f" ({count:,} seeds from there on)" if count > 1 else ""
@@ -107,12 +107,12 @@ class EvaluationPlan:
     config: TrainConfig
     policies: tuple[str, ...]
     perturbations: dict[str, Perturbation | None]  # by requested name or file; None: unperturbed
-    episodes: Mapping[str, int]  # kind -> number
+    episodes: Mapping[str, int]  # kind of episode -> number of episodes
     first_seed: int = FIRST_SEED
     num_envs: int = 32
-    nthread: int = 0  # all cores
+    nthread: int = 0  # threads of the twin; 0: one per core
     layouts: str = "default"
-    limits: Limits | None = None  # every policy drives once more, with this limiter
+    limits: Limits | None = None  # if set, all policies drive all episodes once more, limited
     left_out: dict[str, list[str]] = field(default_factory=dict)  # kind -> floors without room
     loaded: dict[str, Policy] = field(default_factory=dict)  # policies of runs and files, by name
 
@@ -123,7 +123,7 @@ class EvaluationPlan:
 
     @property
     def specs(self) -> list[EpisodeSpec]:
-        """Return the episodes of each perturbation, kinds interleaved."""
+        """Return the episodes to drive under each perturbation, with their kinds interleaved."""
         most = max(self.episodes[kind] for kind in self.kinds)
         return [
             EpisodeSpec(kind, self.first_seed + at)
@@ -134,7 +134,7 @@ class EvaluationPlan:
 
     @property
     def warnings(self) -> list[str]:
-        """Warn of episodes that also selected the kept policy: their results are too good."""
+        """Warn if episodes were also used to select the kept policy: their results are too good."""
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if "agent" not in self.policies or not (
@@ -149,7 +149,7 @@ class EvaluationPlan:
 
     @property
     def origins(self) -> dict[str, PolicyOrigin]:
-        """Return the origin (the step of its run) of each policy that comes from a run."""
+        """Return, for each policy that comes from a run, the step at which the run saved it."""
         own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
         return {name: origin for name, origin in own.items() if origin is not None}
 
@@ -204,7 +204,7 @@ def plan_evaluation(
         if is_cloned(name):
             cloned_panel(run, name)
         elif name == "agent" or _is_path("policies", name):
-            plan.loaded[name] = make_policy(name, plan)  # raises before anything is driven
+            plan.loaded[name] = make_policy(name, plan)  # errors come before anything is driven
     return plan
 
 
@@ -271,7 +271,7 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """Make a policy by name: the run's own, a reference, a clone, or one of a file or other run."""
+    """Make a policy by name: the run's own, a reference, a clone, or a file's or other run's."""
     if name in plan.loaded:
         return plan.loaded[name]
     if name == "agent":
@@ -364,7 +364,7 @@ def evaluate(
             driven), `cloned:DRIVER`, `onnx:FILE` or `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
         episodes: number of each kind, or per kind: `{"nominal": 1000, "wheel_slip": 300}`.
-        layouts: floors to drive on; None: the run's own, with test floors for training floors.
+        layouts: floors to drive on; None: the run's own, but test instead of training floors.
         limiter: "profile" for the profile's `[limiter]`, or a TOML file with one: every policy
             drives once more with this limiter, as `limited:NAME`.
 
@@ -389,7 +389,7 @@ def drive_evaluation(
 ) -> list[dict[str, Any]]:
     """Drive all episodes, add them to the run's `eval/episodes.parquet`, and return their rows."""
     env = evaluation_env(plan)
-    # One queue per policy over all perturbations, so that environments are idle only at its end.
+    # All perturbations share a policy's queue: environments idle only at the end of the queue.
     episodes = [
         (name, msgspec.structs.replace(spec, perturbation=perturbation))
         for name, perturbation in plan.perturbations.items()
@@ -436,7 +436,7 @@ def run_policy(
     specs: Sequence[EpisodeSpec],
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Drive episodes by a policy in a plan's twin; return results in the order of `specs`."""
+    """Drive episodes with a policy in a plan's twin; return results in the order of `specs`."""
     with torch_threads(plan.config.threads):
         return run_episodes(
             env,
@@ -467,7 +467,7 @@ def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
 
 
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
-    """Return the quality of the plan's cloned policies that have driven."""
+    """Return the recorded quality of each clone among the plan's policies."""
     return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
 
 

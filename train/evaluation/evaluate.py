@@ -122,12 +122,12 @@ def run_episodes(
 ) -> list[EpisodeResult]:
     """Drive every episode to its end, N at a time; return results in the order of `specs`.
 
-    `step`, if given, is called in place of `env.step`, with the observations (N, D) as well.
+    `step(observations, actions)`, if given, is called in place of `env.step(actions)`.
     Without a `goal`, success is None, and only episodes with a bump fail. `discount` is per step.
     """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
-    # Environments that have finished keep stepping deterministically.
+    # The seed fixes how environments keep driving once they have no episodes left.
     observation, _ = env.reset(seed=0)
     window = round(STUCK_WINDOW_S / control_period_s)
     steps = np.zeros(env.num_envs, np.int64)
@@ -135,7 +135,7 @@ def run_episodes(
     touching = np.zeros(env.num_envs, np.bool_)
     total, discounted = np.zeros(env.num_envs), np.zeros(env.num_envs)
     distance = np.zeros(env.num_envs)
-    limited = np.zeros((2, env.num_envs), np.int64)  # steps that were limited, and stopped
+    limited = np.zeros((2, env.num_envs), np.int64)  # counts of limited steps, and of those stopped
     track = np.zeros((env.num_envs, time_limit_steps + 1, 2))
     track[:, 0] = _position(env.signals)
     left = len(specs)
@@ -225,7 +225,7 @@ class Score:
     return_mean: float
 
     def beats(self, other: Score | None) -> bool:
-        """Return whether mean success is higher or, if it is equal, the mean return."""
+        """Return whether mean success is higher than the other's, or equal with a higher return."""
         if other is None:
             return True
         best = (other.success_mean, other.return_mean)
@@ -233,7 +233,7 @@ class Score:
 
 
 def score(results: Sequence[EpisodeResult]) -> Score:
-    """Average over the episodes of a condition, then over conditions."""
+    """Average success and return over the episodes of each condition, then over conditions."""
     conditions = dict.fromkeys(result.condition for result in results)
     by = {name: [r for r in results if r.condition == name] for name in conditions}
     success = {
@@ -246,8 +246,8 @@ def score(results: Sequence[EpisodeResult]) -> Score:
     return Score(success, average, float(np.mean(returns)))
 
 
-_ROWS = 512  # measured per condition, chosen by hash
-_CAPACITY = 16_384  # steps kept of one evaluation
+_ROWS = 512  # rows per condition on which the critic is measured, chosen by hash
+_CAPACITY = 16_384  # largest number of steps that are kept of an evaluation
 
 
 class EvaluationBuffer:
@@ -273,7 +273,7 @@ class EvaluationBuffer:
         discount: float | None = None,
         between: Callable[[], None] = lambda: None,
     ) -> list[EpisodeResult]:
-        """Drive every episode, in the order of `specs`, after dropping the steps of earlier ones.
+        """Forget earlier steps, then drive every episode; return results in the order of `specs`.
 
         `between` is called before every step; if it raises, the drive ends.
         """
@@ -354,6 +354,6 @@ class EvaluationBuffer:
 
 
 def _explained_share(td: Tensor, target: Tensor) -> float | None:
-    """Return the explained share of the targets' variance (n,); None without variance."""
+    """Return which share of the variance of targets (n,) Q explains; None if they do not vary."""
     spread = float(target.var(unbiased=False))
     return 1.0 - float(td.var(unbiased=False)) / spread if spread > 0 else None

@@ -31,10 +31,10 @@ from restock.train.twin.env.interface import Step
 from restock.train.twin.env.render import draw_map
 from restock.train.twin.physics.episode import EpisodeSpec
 
-FOLDER = Path("eval") / "films"  # in a run
+FOLDER = Path("eval") / "films"  # relative to the run's folder
 DOCUMENT = "films.json"
 WORST, RESCUE = "worst failure", "rescue"
-RESCUED_FROM = ("planner", "cloned", "operator")  # policies to rescue from, after other runs
+RESCUED_FROM = ("planner", "cloned", "operator")  # failures to show if no other run's fits
 OTHER_RUN = "run:"
 CAPTION_PIXELS, GAP_PIXELS = 44, 12
 MAX_FRAMES = 60
@@ -56,11 +56,11 @@ class Scene:
 
 
 def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
-    """Choose the scenes to film: per condition, unperturbed, a failure and a rescue by the agent.
+    """Choose, per condition, the agent's worst failure and best rescue in unperturbed episodes.
 
-    The failure is that with the lowest return. The rescue is the agent's success with the highest
-    return among the episodes in which another policy failed. Policies of other runs are preferred,
-    those that arrive least often first. A condition may have no such scene.
+    The worst failure has the lowest return. A rescue is a success of the agent in an episode in
+    which another policy failed; the best one has the highest return. Failures of other runs are
+    preferred, first of the run that arrives least often. A condition may lack either scene.
     """
     clean = [row for row in rows if row["perturbation"] == CLEAN and row["success"] is not None]
     others = {
@@ -145,8 +145,8 @@ def film_evaluation(
 def _film_failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
     """Film another policy's drive; None if it cannot be repeated exactly.
 
-    That happens if its run is missing or has changed, or if its actions depend on the other
-    environments that it drove at the same time.
+    The drive cannot be repeated if the policy's run is missing or has changed, or if the policy's
+    actions depend on the other environments that it drove at the same time.
     """
     try:
         result, frames = drive_again(plan, row)
@@ -226,7 +226,7 @@ def _document(scene: Scene, file: str) -> dict[str, Any]:
 
 
 def _caption(row: dict[str, Any]) -> str:
-    """Return who drove and how it ended, short enough to fit above a picture."""
+    """Return who drove and how the episode ended, short enough to fit above a picture."""
     ended = "arrives" if row["success"] else row["failure"]
     who = policy_words([row["policy"]])[row["policy"]]
     return f"{who}: {ended}, {row['time_s']:.1f} s"

@@ -101,7 +101,7 @@ def to_onnx(network: PolicyNetwork) -> Any:
             graph.constants,
         ),
         opset_imports=opsets,
-        # The oldest format with these operators, as the old runtimes of robots refuse newer ones.
+        # The oldest format that has these operators: old runtimes on robots refuse newer formats.
         ir_version=onnx.helper.find_min_ir_version_for(opsets),
         producer_name="restock",
         producer_version=__version__,
@@ -130,7 +130,7 @@ class _Graph:
         return self.node("Gemm", [inputs, weight, bias], name, transB=1)
 
     def values(self, network: nn.Module, name: str) -> str:
-        """Add the nodes of one network's action values (N, A), or of an ensemble's mean."""
+        """Add the nodes that compute a network's action values (N, A), or an ensemble's mean."""
         if isinstance(network, Ensemble):
             total, *others = [
                 self.values(member, f"{name}.{index}")
@@ -173,7 +173,7 @@ class _Graph:
         return self.node("Where", [plausible, values, none], output)
 
     def propose(self, network: ProposalNetwork, values: str, output: str) -> str:
-        """Add the nodes that add the margin to the proposed action's value, (N, A)."""
+        """Add the nodes that raise the proposed action's value by the margin; values are (N, A)."""
         nearest = self.constant("proposal.nearest", _array(network.nearest))
         offset = self.constant("proposal.offset", _array(network.offset))
         near = self.node("Gemm", ["observation", nearest, offset], "proposal.near", transB=1)

@@ -58,9 +58,9 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class OpeEpisodes:
-    """Logged episodes with the evaluated policy's ratios, padded with `ratio` 1 and `reward` 0."""
+    """n logged episodes with importance ratios, padded to T steps with `ratio` 1 and `reward` 0."""
 
-    ratio: F64  # (n, T) probability of the action, evaluated policy / behaviour policy
+    ratio: F64  # (n, T) probability of the action under the evaluated / the behaviour policy
     reward: F64  # (n, T)
     start_value: F64  # (n,) the fitted model's value of the first observation
     discount: float
@@ -84,32 +84,32 @@ class OpeEpisodes:
 
 
 def once(episodes: int) -> F64:
-    """Return counts in which every episode counts once, (1, n)."""
+    """Return bootstrap counts (1, n) in which every episode counts once."""
     return np.ones((1, episodes))
 
 
 def relative_weights(ratio: F64) -> F64:
-    """Return products of ratios up to each step (n, T), scaled to a maximum of 1 at each step."""
-    with np.errstate(divide="ignore"):  # -inf for 0
+    """Return the product of ratios up to each step, (n, T), with a maximum of 1 at each step."""
+    with np.errstate(divide="ignore"):  # the log of 0 is -inf
         logs: F64 = np.cumsum(np.log(ratio), axis=1)
     most = logs.max(axis=0, initial=-np.inf)
     return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
 
 
 def per_decision(logged: OpeEpisodes, counts: F64) -> F64:
-    """Return estimates (B,) of per-decision weighted importance sampling, for `counts` (B, n)."""
+    """Return per-decision weighted importance sampling estimates (B,), for resamples (B, n)."""
     weight = relative_weights(logged.ratio)
     means = counts @ (weight * logged.reward) / np.maximum(counts @ weight, _TINY)  # (B, T)
     return np.asarray(means @ logged.discounts, np.float64)
 
 
 def fitted(logged: OpeEpisodes, counts: F64) -> F64:
-    """Return the model's mean values (B,) of the first observations, for `counts` (B, n)."""
+    """Return the model's mean value of first observations, (B,), for resamples `counts` (B, n)."""
     return np.asarray(counts @ logged.start_value / counts.sum(axis=1), np.float64)
 
 
 def observed(logged: OpeEpisodes, counts: F64) -> F64:
-    """Return the mean returns (B,) of the behaviour policies themselves, for `counts` (B, n)."""
+    """Return the behaviour policies' own mean return, (B,), for resamples `counts` (B, n)."""
     return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
 
 
@@ -125,7 +125,7 @@ def effective_episodes(ratio: F64) -> F64:
 class EssGate:
     """The effective sample size that weighted estimates need at every step."""
 
-    share: float = 0.2  # of the episodes
+    share: float = 0.2  # least effective episodes, as a share of all
     episodes: float = 5.0
 
     def refusal(self, logged: OpeEpisodes) -> str | None:
@@ -133,7 +133,7 @@ class EssGate:
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
             return None
-        if len(logged) < self.episodes:  # refused even if policy and logs fully agree
+        if len(logged) < self.episodes:  # too few even if policy and logs fully agree
             noun = "episode" if len(logged) == 1 else "episodes"
             return f"{len(logged)} {noun}, and weights need at least {self.episodes:g}"
         return (
@@ -143,7 +143,7 @@ class EssGate:
         )
 
     def measure(self, logged: OpeEpisodes) -> tuple[float, int]:
-        """Return the lowest effective number of episodes, and how many first steps have enough."""
+        """Return the lowest effective number of episodes, and the first step with too few."""
         if not len(logged):
             return 0.0, 0
         effective = effective_episodes(logged.ratio)
@@ -199,7 +199,7 @@ FILE = "off_policy.parquet"  # in RUN/eval
 class OpeConfig:
     """Settings of off-policy evaluation."""
 
-    epsilon: float = 0.1  # probability of a random action: the greedy policy made soft
+    epsilon: float = 0.1  # probability of a random action, which makes the greedy policy soft
     seed: int = 0
     model: FittedQConfig = field(default_factory=FittedQConfig)
 
@@ -254,7 +254,7 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 
     Args:
         path: the run.
-        logs: a store, or a panel to use the held-out episodes of; None: the run's own panel.
+        logs: a store, or a panel whose held-out episodes are used; None: the run's own panel.
 
     Raises:
         RunError: there is no such run, it has no policy yet, or it learned from all episodes.
@@ -310,7 +310,7 @@ def _warn_of_long_episodes(task: Task, steps: OpeSteps, reach: int) -> tuple[str
 
 
 def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
-    """Return the measures that logs allow: without success if goals are missing or in hindsight."""
+    """Return the measures to estimate: no success if goals are missing or were set in hindsight."""
     logged = task.goal == "route" and not dataset.hindsight
     return ("return", "success") if logged else ("return",)
 
@@ -324,7 +324,7 @@ def evaluate_off_policy(
     config: OpeConfig = OpeConfig(),
     between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
-    """Return the rows of `off_policy`, one per measure, condition of the episode and estimator.
+    """Return the rows of the table `off_policy`: one per measure, episode condition and estimator.
 
     `between` is called before every update of the models; if it raises, the evaluation ends.
     """
@@ -358,7 +358,7 @@ def evaluate_off_policy(
                 "ess": ess,
                 "ess_steps": ess_steps,
                 "steps": part.ratio.shape[1],
-                "horizon": None,  # all steps are weighted
+                "horizon": None,  # None: all steps are weighted
                 "epsilon": config.epsilon,
                 "discount": gamma,
                 "estimated_share": estimated,

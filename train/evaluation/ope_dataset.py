@@ -27,26 +27,26 @@ from restock.replay.store.store import Store
 from restock.train.dqn.fitted_q import Transitions
 
 Measure = Literal["return", "success"]
-MODEL_ROWS = 200_000  # most rows that a model is fitted on, chosen at random; limits memory, time
+MODEL_ROWS = 200_000  # a model is fitted on at most so many random rows, to save memory and time
 
 
 @dataclass(frozen=True)
 class OpeSteps:
-    """N rows by episode and step; episodes may lack their last steps."""
+    """N rows, sorted by episode and step; episodes may lack their last steps."""
 
     rows: Transitions
     episode: Ints  # (N,) ascending, index in `condition`
     condition: NDArray[np.str_]  # (E,) of each episode
-    probability: F64  # (N,) of the action, as logged; NaN if it was not logged
-    bumps: Bools  # (N,) a contact in [t, t + 1)
-    bumped_before: Bools  # (N,) a contact in the episode up to t
+    probability: F64  # (N,) logged probability of the action; NaN if not logged
+    bumps: Bools  # (N,) whether there was a contact in [t, t + 1)
+    bumped_before: Bools  # (N,) whether there was a contact in the episode up to t
 
     def measured(self, measure: Measure) -> OpeSteps:
-        """Return the same rows with the measure as their reward.
+        """Return the rows with the measure as their reward.
 
-        `return` is the task's own reward. `success` is 1 on reaching the goal and else 0, and a
-        contact ends the episode. With a discount of 1, its return is the probability of arriving
-        without contact.
+        `return` is the task's own reward. `success` is 1 on reaching the goal and else 0. A contact
+        then ends the episode, and rows after it are left out. With a discount of 1, the return of
+        `success` is the probability of arriving without contact.
         """
         if measure == "return":
             return self
@@ -79,8 +79,8 @@ class OpeSteps:
 class OpeDataset:
     """The steps that a policy is evaluated on, and those that models are fitted on."""
 
-    training: OpeSteps  # that the policy learned from; for the models
-    evaluation: OpeSteps  # of other episodes
+    training: OpeSteps  # steps that the policy learned from; models are fitted on them
+    evaluation: OpeSteps  # steps that the policy did not learn from
     notes: tuple[str, ...]  # for the user
     hindsight: bool = False  # goals were set in hindsight, so arriving is not a success
 
@@ -92,9 +92,9 @@ def load_ope_dataset(
 
     Args:
         trained: the panel that the run learned from; the models are fitted on its rows.
-        task: that the run was trained on.
-        logs: a store, or a panel to use the held-out rows of; None: the run's own panel.
-        seed: of the choice of rows for the models, if there are more than `MODEL_ROWS`.
+        task: the task that the run was trained on.
+        logs: a store, or a panel whose held-out rows are used; None: the run's own panel.
+        seed: for choosing the models' rows at random if there are more than `MODEL_ROWS`.
 
     Raises:
         RunError: the run had no panel, no episode is left, or the logs are of another task.
@@ -162,7 +162,7 @@ def _has_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
 
 
 def _open(logs: str | None, trained: Panel, task: Task) -> tuple[Store, Ints]:
-    """Open the store of the logs; return it with its rows' IDs, or a panel's held-out ones."""
+    """Open the logs' store; return it with the IDs of its rows, or of a panel's held-out rows."""
     panel: Panel | None = trained
     if logs is not None:
         location = Location.of(logs)
@@ -216,7 +216,7 @@ def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
 
 
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
-    """Read the rows with these IDs, by recording, episode and step."""
+    """Read the rows with these IDs, sorted by recording, episode and step."""
     query = files(__package__).joinpath("ope_episodes.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         table = connection.sql(query).to_arrow_table()
@@ -263,7 +263,7 @@ def panel_store(panel: Panel) -> Store:
 
 
 def _exclude_trained(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
-    """Return the rows of episodes without rows in the panel, and the number of episodes left out.
+    """Leave out episodes that have rows in the panel; return the other IDs and the number left out.
 
     An episode is also left out if it has a copy of one of the panel's rows under another ID.
     """

@@ -17,10 +17,10 @@ from restock.train.run.run import Run
 
 AGENT = "agent"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive"]
-MARGIN = 0.05  # success may be lower by this without being called worse
-MIN_EPISODES = 10  # with fewer there is no interval and no verdict
+MARGIN = 0.05  # a policy is not called worse if its success is lower by up to this
+MIN_EPISODES = 10  # with fewer episodes there is no interval and no verdict
 Cell = tuple[str, str]  # perturbation, condition (with its block)
-Key = tuple[int, str]  # of an episode: seed, values of its perturbation
+Key = tuple[int, str]  # identifies an episode: seed, values of its perturbation
 Episodes = dict[Cell, dict[Key, tuple[float, float]]]  # success (NaN without a goal) and return
 
 
@@ -32,7 +32,7 @@ def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
 
 
 def by_cell(table: pa.Table) -> Episodes:
-    """Return success and return by cell and episode."""
+    """Return the success and return of each episode, by cell."""
     cells: Episodes = {}
     for row in table.to_pylist():
         cell = str(row.get("perturbation", "none")), cell_name(row["condition"], row["block"])

@@ -208,9 +208,9 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
     """Write a run that acts by the mean of several runs' action values, and load its policy.
 
     Independent runs have different errors, so their mean has smaller ones (arXiv:1611.01929). If
-    the runs filter actions, the mean of their behaviour networks' logits filters. If the planner
-    taught them, the margin by which an action must beat its proposal is divided by the root of the
-    number of runs, as errors are. The new run has no tables, as it was fed nothing itself.
+    the runs filter actions, the new run filters by the mean of their behaviour networks' logits. If
+    the planner taught them, the margin by which an action must beat its proposal shrinks like the
+    errors, by the root of the number of runs. The new run has no tables, as it was fed nothing.
 
     Raises:
         RunError: the runs differ in more than their seeds, or one has no policy.
@@ -257,8 +257,8 @@ def _mean(networks: Sequence[Any]) -> Ensemble:
 
 
 CLONED = "cloned"
-UPDATES = (50, 100, 200, 400, 800, 1600)  # numbers of updates that are tried
-SET_ASIDE = 5  # every fifth episode is set aside to choose between them
+UPDATES = (50, 100, 200, 400, 800, 1600)  # numbers of updates that are tried to fit a clone
+SET_ASIDE = 5  # every fifth episode is set aside to choose among `UPDATES`
 
 
 class ClonedPolicy:
@@ -315,7 +315,7 @@ def load_cloned(run: Run, name: str, *, seed: int = 0) -> ClonedPolicy:
 
     Args:
         name: `cloned` for all rows of the run's panel, or `cloned:DRIVER` for one driver's.
-        seed: of the actions that it draws.
+        seed: for drawing the actions.
 
     Raises:
         ConfigError, PanelError: as `cloned_panel`.
@@ -415,7 +415,7 @@ def _held_out_quality(
 ) -> dict[str, Any]:
     """Compute the fields of a `CloneQuality` that describe held-out rows.
 
-    `first` is the index of the previous action in an observation.
+    `first` is the index in an observation at which the previous action's one-hot code begins.
     """
     if not len(action):
         unknown = ("log_likelihood", "frequencies_log_likelihood", "agreement", "repeating")
@@ -440,7 +440,7 @@ def _frequencies(action: Ints, actions: int) -> F32:
 
 
 def _log_likelihood(network: QNetwork, observation: F32, action: Ints) -> float:
-    """Return the mean of log G(a|s) over rows, in nats."""
+    """Return the mean log-probability of the actions under a cloned network, in nats."""
     probability = cloned_probabilities(network, observation)[np.arange(len(action)), action]
     return float(np.log(np.maximum(probability, 1e-12)).mean())
 
