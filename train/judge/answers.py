@@ -21,9 +21,9 @@ from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run, s
 
 RESAMPLES = 200
 _MIN_RESPONSE = 0.4  # share of the expected response; a mission with less does not respond
-_MIN_SIGNAL = 10.0  # expected motion over noise from which a mission's response can be judged
+_MIN_SIGNAL = 10.0  # a mission is judged if its expected motion is this many times the noise
 MIN_CLUSTERS = 5
-_RIDGE = 1e-4  # of the mean diagonal; for lags that the rows cannot tell apart
+_RIDGE = 1e-4  # share of the mean diagonal; keeps fits solvable if rows cannot tell lags apart
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Response:
     clusters: int
     gain: float
     delay: float  # steps
-    unexplained: float  # share of y's mean square
+    unexplained: float  # share of y's mean square that the fit leaves
     gains: F64  # (R,)
     delays: F64  # (R,)
     unexplained_draws: F64  # (R,)
@@ -46,7 +46,7 @@ class Response:
     def unresponsive(self, kernel: F64) -> tuple[int, int]:
         """Count the clusters that do not respond as `kernel` predicts, and those that were judged.
 
-        A cluster is judged if it moves enough. Both counts are 0 below `MIN_CLUSTERS` of these.
+        Clusters are judged if they move enough. Both counts are 0 if fewer than `MIN_CLUSTERS` do.
         """
         xx, xy = self.moments[:, :-1, :-1], self.moments[:, :-1, -1]
         moved = np.einsum("i,cij,j->c", kernel, xx, kernel)
@@ -91,7 +91,7 @@ def fit_response(
         drawn = drawn - rows[..., None] * mean[:, :, None] * mean[:, None, :]
     xx, xy, yy = drawn[:, :-1, :-1], drawn[:, :-1, -1], drawn[:, -1, -1]
     ridge = _RIDGE * np.trace(xx, axis1=1, axis2=2) / (width - 1)
-    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters with constant x
+    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # 0 if a draw has only clusters with constant x
     h = np.linalg.solve(xx + ridge[:, None, None] * np.eye(width - 1), xy[..., None])[..., 0]
     gain = h.sum(axis=1)
     safe = np.where(np.abs(gain) > 1e-9, gain, 1e-9)
@@ -107,9 +107,9 @@ def fit_response(
 
 
 def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
-    """Return the interval of a ratio of two statistics with independent draws (R,), values `at`.
+    """Return the interval of the ratio of two statistics: values `at`, independent draws (R,).
 
-    `clusters` is the smaller of their two numbers of clusters.
+    `clusters` is the number of clusters of the statistic that has fewer.
     """
     bottom = np.where(np.abs(below) > 1e-9, below, np.nan)
     return interval_of(at[0] / at[1] if at[1] else float("nan"), above / bottom, clusters)
@@ -118,7 +118,7 @@ def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> 
 def difference_of(
     first: F64, second: F64, at: tuple[float, float], clusters: int
 ) -> ConfidenceInterval:
-    """Return the interval of a difference of two statistics, as `ratio_of` does of a ratio."""
+    """Return the interval of the difference of two statistics; arguments as in `ratio_of`."""
     return interval_of(at[0] - at[1], first - second, clusters)
 
 
@@ -138,26 +138,26 @@ def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
 ACTION_SPEED, ACTION_TURN = "action (speed)", "action (turn)"
 WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
 POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
-COMMANDS = np.arange(-4, 8)  # lags: robots respond late, and logs may be wrong either way
+COMMANDS = np.arange(-4, 8)  # lags in steps: responses come late, or early if logs are wrong
 SENSORS = np.arange(-3, 4)
 PLANS = np.arange(-3, 7)
 NOW = np.zeros(1, np.int64)
 _JUMP_RAD, _JUMP_M = 0.8, 0.6  # larger changes in one step mean that the plan was replaced
-_SLOW_MPS = 0.3  # below it a waypoint's bearing changes by turning, not by driving past it
+_SLOW_MPS = 0.3  # below this speed a waypoint's bearing changes by turning, not by driving past it
 _MAX_ASIDE = 0.5  # largest sine of the waypoint's bearing at which driving shortens the route
-_MIN_KEPT = 0.5  # least share of the motion that must remain without the rows near slip
-_MIN_CLEAN = 0.1  # least share of a recording's motion without slip, to put slip down to the floor
-_MIN_EPISODES = 5  # recordings with fewer are judged together
+_MIN_KEPT = 0.5  # rows near slip are left out if at least this share of the motion remains
+_MIN_CLEAN = 0.1  # with less of a recording's motion free of slip, the floor is not at fault
+_MIN_EPISODES = 5  # recordings with fewer episodes are judged together
 _NEAR_STEPS = 5
 _FAR = 0.97  # lidar entries beyond this saw nothing
 SlipLeftOut = Literal["episodes", "rows", "none"]
-GAIN = 1.2  # largest gain of the logs over the twin's, or its inverse: robots differ
-ALIKE = 1.05  # the same for two sensors that measure one motion
+GAIN = 1.2  # largest ratio of the logs' gain to the twin's, either way: robots differ
+ALIKE = 1.05  # `GAIN` for two sensors that measure the same motion
 BIAS_RADPS = 0.02  # largest turn that one sensor may show while another shows none
-TURN_RADPS = 0.06  # and while the action has none
+TURN_RADPS = 0.06  # largest turn that a sensor may show while the action has none
 BIAS_MPS2 = 0.2
-SIDEWAYS = 0.06  # largest sideways over forward motion, about 3 degrees
-ARM_M = 0.06  # largest distance from the point that the robot turns about to that of its pose
+SIDEWAYS = 0.06  # largest ratio of sideways to forward motion, about 3 degrees
+ARM_M = 0.06  # largest distance between the pose's point and the point that the robot turns about
 STRAYED = 0.05  # largest share of missions without response, beyond the twin's
 _STRAIGHT_RADPS = 0.15  # slower turns count as driving straight
 
@@ -171,10 +171,10 @@ class Relation:
     y: str
     lags: Ints
     of: Callable[[FedRows], tuple[F64, F64]]  # returns x and y of the rows, (N,) or (N, S) each
-    defined: bool = True  # x and y are one quantity: without a twin, the expected gain is 1
-    zero: str = ""  # name of a figure that replaces the gain and is 0 in the twin
-    most: float = GAIN  # largest gain over the twin's, or its inverse; for `zero`, of the figure
-    offset: float = math.inf  # largest y when x is 0, less the twin's, in y's unit
+    defined: bool = True  # x and y are the same quantity: without a twin, the expected gain is 1
+    zero: str = ""  # name under which the gain is reported if it should be 0; else ""
+    most: float = GAIN  # largest ratio to the twin's gain, either way; with `zero`, largest |gain|
+    offset: float = math.inf  # largest difference to the twin's y when x is 0; inf: no limit
     unit: str = "m/s"  # of y
 
     def fit(
@@ -196,8 +196,8 @@ class Relation:
         """Return which logged rows to leave out, so that the robot is not blamed for a wet floor.
 
         If wheels slip, the floor decides how a robot moves, also in the rows around the labelled
-        ones. So whole episodes are left out as long as others remain. But a wrong sensor looks like
-        slip, too, all the time: then nearly every episode of its recording has the label.
+        ones. So episodes with slip are left out as a whole if others remain. A wrong sensor is
+        labelled as slip, too, but in nearly all episodes: then fewer rows are left out, or none.
         """
         moves = _motion(*self.of(rows))
         if _find_slippery_episodes(rows, moves).any():
@@ -218,9 +218,9 @@ def _rows_to_leave_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
 
 
 def _find_slip(rows: FedRows) -> Bools:
-    """Return which rows (N,) slip: labelled rows of episodes that mostly do not move as the wheels.
+    """Return which rows (N,) slip: labelled rows of episodes whose labels are mostly right.
 
-    A robot that moves as far as its wheels turn, but not where its pose heads, does not slip.
+    A label is wrong if the robot moves as far as its wheels turn, only not where its pose heads.
     """
     labelled = rows.condition == "wheel_slip"
     moved = np.hypot(rows.after("localised_speed"), rows.after("lateral_speed"))
@@ -241,7 +241,7 @@ def _near_slip(rows: FedRows) -> Bools:
 
 
 def _find_slippery_episodes(rows: FedRows, moves: F64) -> Bools:
-    """Return which rows (N,) are of episodes with slip, in recordings that also move without it."""
+    """Return which rows (N,) are in episodes with slip, of recordings that also move without."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
@@ -271,7 +271,7 @@ def _straight_speeds(rows: FedRows) -> tuple[F64, F64]:
     """Return the pose's speeds forward and sideways (m/s); sideways is NaN in turns."""
     forward, aside = rows.after("localised_speed"), rows.after("lateral_speed")
     straight = np.abs(rows.after("gyro_yaw_rate")) < _STRAIGHT_RADPS
-    return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: there was no new pose
+    return forward, np.where(straight & (aside != 0.0), aside, np.nan)  # 0: no new pose
 
 
 def _turn_and_drift(rows: FedRows) -> tuple[F64, F64]:
@@ -287,7 +287,7 @@ def _wheel_acceleration(rows: FedRows) -> F64:
 
 
 def _waypoint_turn(rows: FedRows) -> F64:
-    """Return the yaw rate (rad/s) by the near waypoint's bearing; NaN if driving or replanning."""
+    """Return the yaw rate (rad/s) by the waypoint's bearing; NaN if driving or replanned."""
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
     after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
     change = (after - now + np.pi) % (2 * np.pi) - np.pi
@@ -310,7 +310,7 @@ def _route_speed(rows: FedRows) -> F64:
 
 
 def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
-    """Return how lidar sectors (N, S) would change by `turn` (rad/s) on the spot, and how they did.
+    """Return the change of lidar sectors (N, S) expected from `turn` (rad/s), and the actual one.
 
     The actual change is NaN if nothing was seen, at edges, and in slow turns.
     """
@@ -364,18 +364,18 @@ RELATIONS = (
 )  # fmt: skip
 
 
-NOISY_GAIN = 2.0  # `GAIN` for relations whose x and y are not one quantity
+NOISY_GAIN = 2.0  # `GAIN` for relations whose x and y are different quantities
 DELAY_STEPS = 0.6
 LATEST_STEPS = 2.0  # without a twin: how late a robot may respond to its commands
-UNEXPLAINED = 0.2  # largest unexplained share, less the twin's
-_MAX_LEFT = 0.5  # largest unexplained share if x and y are one quantity, with a twin or without
-NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` if x and y are not one quantity: driver and place matter
-_KNOWN_GAIN = 0.3  # a delay means nothing if the gain over the twin's is smaller
+UNEXPLAINED = 0.2  # largest unexplained share, after subtracting the twin's
+_MAX_LEFT = 0.5  # largest unexplained share if x and y are the same quantity, whatever the twin's
+NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` for different quantities: driver and place matter, too
+_KNOWN_GAIN = 0.3  # if the gain, relative to the twin's, is smaller, a delay means nothing
 HELD = 3  # consecutive steps of one action after which the motion counts as that action's
-_MIN_HELD = 15  # rows
-_MIN_DISTANCE = 0.25  # of the fastest action on each axis
-_MIN_SHARE = 0.8  # least share of an action's rows that must move as one other action
-TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and rows left out
+_MIN_HELD = 15  # least rows that hold an action, to judge its motion
+_MIN_DISTANCE = 0.25  # from an action's own motion; 1 is the fastest action on each axis
+_MIN_SHARE = 0.8  # an action is another one if at least this share of its rows moves like that
+TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # (relation, rows left out) -> fit
 
 
 @dataclass(frozen=True)
@@ -383,8 +383,8 @@ class Broken:
     """The stretches of a robot's drives in which a relation does not hold."""
 
     off_by: float  # root mean square error in these stretches, in the unit of y
-    usually: float  # the same in all stretches of the other robots
-    mended: dict[str, tuple[float, float]]  # cause -> share that holds once it is undone, its size
+    usually: float  # root mean square error in all stretches of the other robots
+    mended: dict[str, tuple[float, float]]  # cause -> (share that holds without, its size)
 
 
 @dataclass
@@ -393,11 +393,11 @@ class Answer:
 
     relation: Relation
     comparisons: list[Comparison]
-    gain: float  # logs over twin; NaN if unknown
-    delay: float  # logs less twin, in steps
+    gain: float  # ratio of the logs' to the twin's; NaN if unknown
+    delay: float  # the logs' less the twin's, in steps
     rows: FedRows | None = None  # of the logs; None if not comparable with other robots' rows
-    found: Response | None = None  # of the logs
-    broken: Broken | None = None  # set if it breaks in more stretches than other robots' do
+    found: Response | None = None  # the logs' fit
+    broken: Broken | None = None  # set if more stretches break than for other robots
 
     @property
     def off(self) -> bool:
@@ -405,7 +405,7 @@ class Answer:
 
     @property
     def holds(self) -> bool:
-        """Return whether the relation holds once it has its own scale, delay and zero."""
+        """Return whether the relation holds, apart from a wrong scale, delay or zero."""
         left = self.found.unexplained if self.found is not None else 0.0
         return not self.is_off("unexplained") and (not self.relation.defined or left <= _MAX_LEFT)
 
@@ -420,7 +420,7 @@ class Answer:
 
 
 def answers(logs: FedRows, twin: FedRows | None, of_twin: TwinFits) -> list[Answer]:
-    """Compare every relation. `of_twin` caches the twin's fits between calls."""
+    """Compare every relation in logs and twin. `of_twin` caches the twin's fits between calls."""
     rng = np.random.default_rng([0, 1])
     return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
 
@@ -544,7 +544,7 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison
         nearest = int(np.bincount(away.argmin(axis=1)).argmax())
         share = float((away.argmin(axis=1) == nearest).mean())
         is_other = nearest != action and middle[action] > _MIN_DISTANCE and share >= _MIN_SHARE
-        # There is no interval: a share of rows decides.
+        # The status follows from the share of rows alone, without an interval.
         yield Comparison(
             ACTION + name, what, "distance", "off" if is_other else "ok",
             logs=float(middle[action]), twin=float(middle[nearest]), effect=float(middle[action]),

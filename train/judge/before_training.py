@@ -46,10 +46,10 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 
 MIN_ROWS = 500  # fewer rows are never called healthy, and smaller parts are not compared
-MOST = 40  # parts that are compared: the largest ones
+MOST = 40  # at most so many parts are compared: the largest ones
 RECORDINGS_CHECK = "recordings"
 _MAX_PARTS = 0.8  # a fault in a larger share of the parts is reported for all rows
-_MAX_NAMES = 3  # parts or files that a text names
+_MAX_NAMES = 3  # at most so many parts or files are named in a text
 
 
 @dataclass
@@ -71,9 +71,9 @@ class Part:
 def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
     """Split rows into parts: all rows, then each robot's and recording's if several are large.
 
-    Robots are parts if all recordings are tagged with one of several. Recordings are parts, too, if
-    each has `MIN_ROWS` rows. Without robots, shorter recordings are grouped with those that started
-    around the same time. The comparison counts the parts; it is None if there is one recording.
+    Robots are parts if there are several and every recording is tagged with one. Recordings are
+    parts, too, if each has `MIN_ROWS` rows. Without robots, recordings that are shorter are grouped
+    by their start. The returned comparison counts the parts; None if there is one recording.
     """
     parts = [Part("", "", logs)]
     recordings, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
@@ -111,9 +111,9 @@ def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
 
 
 def _group_by_start(logs: FedRows) -> NDArray[np.str_]:
-    """Return the group of each row (N,): recordings that started one after the other.
+    """Group recordings that started one after the other; return the group of each row, (N,).
 
-    A group has at least `MIN_ROWS` rows, or more, so that there are at most `MOST` groups.
+    A group has at least `MIN_ROWS` rows, and more if there would be over `MOST` groups.
     """
     names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
     place = place.reshape(-1)
@@ -121,7 +121,7 @@ def _group_by_start(logs: FedRows) -> NDArray[np.str_]:
     np.minimum.at(start, place, logs.logged_ns)
     order = np.argsort(start, kind="stable")
     middle = np.cumsum(rows[order]) - rows[order] / 2
-    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # ends may lose half of two
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # leeway for whole recordings
     begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
     named = np.empty(len(names), object)
     for first, end in pairwise(begins.tolist()):
@@ -141,7 +141,7 @@ def _merge_findings(
             again = sum(one.cause == other.cause for other in of_part[:place])
             by_cause.setdefault((one.cause, part.kind, again), []).append((part, one))
     of_some: list[Finding] = []
-    reported: dict[str, str] = {}  # cause -> kind of parts
+    reported: dict[str, str] = {}  # cause -> kind of the parts in which it was first found
     for (cause, kind, _), some in by_cause.items():
         if reported.setdefault(cause, kind) != kind:
             continue  # already reported by robot
@@ -200,7 +200,7 @@ class RowDiagnosis:
 
 
 class OpenedRows(NamedTuple):
-    """Rows of a panel or store, with what their store adds."""
+    """Rows of a panel or store, with their profile, and checks and file names from their store."""
 
     rows: FedRows
     profile: Profile
@@ -226,7 +226,7 @@ def diagnose_before_training(
 
     Raises:
         RunError: the path is neither a panel nor a store.
-        PanelError, StoreError: it is damaged or has no rows, or its profile cannot be found.
+        PanelError, StoreError: the panel or store is damaged or empty, or lacks its profile.
         ConfigError: the rows are of another task than the profile's.
     """
     begun = time.perf_counter()
@@ -256,7 +256,7 @@ def diagnose_rows(
     same way. `floors` are those that the twin drives on; `files` maps recordings to file names.
     """
     parts, compared = parts_of(rows)
-    of_twin: TwinFits = {}  # the same for every part
+    of_twin: TwinFits = {}  # fits to the twin, shared by all parts
     for part in parts:
         own = part.rows
         inside = np.isin(rows.transition_id, own.transition_id)

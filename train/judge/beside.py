@@ -20,11 +20,11 @@ from restock.train.judge.answers import Answer, Broken, Relation, lagged, wheel_
 from restock.train.judge.fed_rows import Comparison, FedRows, judged, shares_compared
 from restock.train.judge.row_checks import implied_reward
 
-MIN_BESIDE = 4  # robots or recordings, of which one can be the odd one out
+MIN_BESIDE = 4  # fewest robots or recordings that can be compared with each other
 _MIN_AGREEING = 0.75  # least share of the other robots that must agree with their median
-GAIN = 1.02  # largest gain over the others', or its inverse, for two sensors of one motion
-ANSWER, NOISY = 1.15, 1.25  # the same for responses to commands, and for all other relations
-_DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences; the latter of y's mean square
+GAIN = 1.02  # largest ratio to the others' gain, either way, for two sensors of the same motion
+ANSWER, NOISY = 1.15, 1.25  # `GAIN` if quantities are the same, and if they differ
+_DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences of delay and unexplained share
 
 
 def beside_others(
@@ -83,7 +83,7 @@ def _find_comparison(answer: Answer, figure: str) -> Comparison | None:
 def _compare_figure(
     figure: str, own: Comparison, others: Sequence[Comparison], least: float, most: float
 ) -> Comparison | None:
-    """Compare a figure with the median of the others; None if they are too few or do not agree.
+    """Compare a figure with the median of the others; None if the others are too few or disagree.
 
     Gains are compared by their ratio, other figures by their difference.
     """
@@ -123,18 +123,18 @@ def _accept_undecided(row: Comparison) -> Comparison:
 
 
 _WINDOW = 10  # steps of a stretch
-_USUAL, _BROKEN = 0.98, 2.0  # a stretch breaks beyond this quantile of the others' errors, times 2
-_MAX_BROKEN = 0.05  # largest share of broken stretches, less the others'
-_MAX_SPIKES = 0.25  # spikes are a smaller share of the rows in broken stretches
+_USUAL, _BROKEN = 0.98, 2.0  # a stretch with 2 x this quantile of the others' errors breaks
+_MAX_BROKEN = 0.05  # largest share of broken stretches, after subtracting the others' share
+_MAX_SPIKES = 0.25  # errors are spikes if a smaller share of the broken stretches' rows has them
 _MIN_WEIGHT = 0.1  # lags with a smaller share of the kernel's largest weight are ignored
-_SHIFTS = (*range(-10, 0), *range(1, 11))  # shifts that are tried
+_SHIFTS = (*range(-10, 0), *range(1, 11))  # shifts in steps that are tried to mend broken stretches
 
 
 def _compare_stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tally]]) -> None:
-    """Compare the share of stretches in which a relation breaks between each robot and the others.
+    """Compare the share of stretches in which a relation breaks: each robot's with the others'.
 
-    All stretches are compared with one response: the median of the robots' fits. `odd` has each
-    robot's tallies that are off, by check.
+    All stretches are compared with one response: the median of the robots' fits. `odd` has the
+    tallies of each robot that are off, by check.
     """
     relation = answers[0].relation
     fits = [one.found for one in answers if one.found is not None]
@@ -176,7 +176,7 @@ def _compare_stretches(answers: Sequence[Answer], odd: Sequence[Mapping[str, Tal
 
 
 def _odd_rows(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict[str, Bools]:
-    """Return which rows (N,) use an odd value of one of the relation's signals, by check."""
+    """Return, by check, which rows (N,) use an odd value of one of the relation's signals."""
     lags = relation.lags[np.abs(kernel) > _MIN_WEIGHT * np.abs(kernel).max()]
     found = {}
     for check, one in odd.items():
@@ -184,7 +184,7 @@ def _odd_rows(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict
             continue
         if one.signal == relation.x:
             found[check] = np.any([np.roll(one.rows, lag) for lag in lags], axis=0)
-        else:  # a motion of the pose uses two poses
+        else:  # the pose's motion in a row also uses the next row's pose
             after = np.append(one.rows[1:], False) & (one.signal == ends.POSE)
             found[check] = one.rows | after
     return found
@@ -194,25 +194,25 @@ def _odd_rows(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict
 class Stretches:
     """Expected and measured y of one robot and relation, cut into W stretches of its drives."""
 
-    expected: F64  # (N,) by the relation
-    measured: F64  # (N,)
+    expected: F64  # (N,) y that the relation predicts
+    measured: F64  # (N,) y
     episode: Ints  # (N,)
     at: Ints  # (n,) rows that are judged
-    stretch: Ints  # (n,) codes
+    stretch: Ints  # (n,) number of each judged row's stretch, 0 to W - 1
     left: F64  # (W,) mean square error of the relation
     moves: F64  # (W,) mean square of the expected y
 
     @classmethod
     def of(cls, relation: Relation, rows: FedRows, kernel: F64, offset: float) -> Stretches:
-        """Cut a robot's rows, without those that slip and stretches with under half their rows."""
+        """Cut a robot's rows into stretches; drop rows that slip, then stretches half empty."""
         x, measured = relation.of(rows)
         expected = lagged(x, [rows.before(int(lag)) for lag in relation.lags]) @ kernel + offset
-        # Rows with a wrong pose are labelled as slip, too, but it moves more than the wheels turn.
+        # Rows with a wrong pose are labelled as slip, too, but that pose outruns the wheels.
         slips = np.abs(rows.after("localised_speed")) < np.abs(rows.after("wheel_speed"))
         if ends.WHEEL_TURN in (relation.x, relation.y):
             slips = np.abs(rows.after("gyro_yaw_rate")) < np.abs(wheel_turn(rows))
         known = np.isfinite(expected - measured) & ~(slips & (rows.condition == "wheel_slip"))
-        windows = int(rows.step.max(initial=0)) // _WINDOW + 1  # of an episode, at most
+        windows = int(rows.step.max(initial=0)) // _WINDOW + 1  # most windows in an episode
         window = rows.episode * windows + rows.step // _WINDOW
         _, place, count = np.unique(window[known], return_inverse=True, return_counts=True)
         enough = (count >= _WINDOW // 2)[place]
@@ -225,13 +225,13 @@ class Stretches:
         return cls(expected, measured, rows.episode, at, stretch, left, moves)
 
     def relative_error(self, usually: float) -> F64:
-        """Return the error of each stretch (W,), over its motion plus the usual mean square."""
+        """Return each stretch's root mean square error (W,) over its own plus the usual motion."""
         return np.sqrt(self.left / np.maximum(self.moves + usually, 1e-12))
 
     def mended(
         self, broken: Bools, most: float, usually: float, odd: Mapping[str, Bools]
     ) -> dict[str, tuple[float, float]]:
-        """Return the share of broken stretches that hold once each cause is undone, and its size.
+        """Return, by cause, the share of broken stretches that hold if it is undone, and its size.
 
         Args:
             broken: which stretches (W,) break.
@@ -265,7 +265,7 @@ class Stretches:
         }
 
     def _expected_earlier(self, steps: int) -> F64:
-        """Return the expected y `steps` earlier, (n,); NaN if that is in another episode."""
+        """Return the expected y `steps` earlier, (n,); NaN if that step is in another episode."""
         row = np.clip(self.at - steps, 0, len(self.expected) - 1)
         same = self.episode[row] == self.episode[self.at]
         return np.where(same, self.expected[row], np.nan)
@@ -293,7 +293,7 @@ PROPOSED, REPLACED = "proposed: ", "goals replaced"
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of tally: what is counted, and the largest share beyond the other robots'."""
+    """A kind of tally: what is counted, and by how much its share may exceed other robots'."""
 
     what: str  # for people
     most: float
@@ -311,13 +311,13 @@ _KINDS = {
     FLICKER: _Kind("sector that sees something else for one row", 0.02),
     REWARDS: _Kind("row's reward is not exactly the task's own", 0.02),
 }
-_MOVES = 0.2  # of the fastest command
-_EQUAL = 1e-5  # of a signal's spread: smaller differences are none
-_SAME = 1e-4  # m/s or rad/s: smaller differences between two signals are none
-_MIN_DRIVEN = 100  # rows of a driver
-_LESS = 0.9  # a limit counts below this share of the others' median
+_MOVES = 0.2  # a command moves the robot above this share of the fastest command
+_EQUAL = 1e-5  # values equal each other up to this share of their signal's spread
+_SAME = 1e-4  # two signals equal each other up to this difference, in m/s or rad/s
+_MIN_DRIVEN = 100  # least rows of a driver whose actions are counted
+_LESS = 0.9  # a robot's maximum is odd only below this share of the others' median
 _UNSEEN = 0.999  # lidar entries of at least this saw nothing
-_JUMP, _STILL = 0.15, 0.05  # a flicker differs from both neighbours; these hardly differ
+_JUMP, _STILL = 0.15, 0.05  # a flicker differs by more from the rows around it, they by less
 _EXACT = 2e-3  # largest error of a reward that is the task's own
 
 
@@ -329,8 +329,8 @@ class Tally:
     signal: str  # a signal of the relations, or a driver; "" if the kind needs none
     found: int
     of: int
-    size: float = 0.0  # seconds at a time for `HELD`, the largest value for `LIMIT` and `FAR`
-    rows: Bools | None = None  # (N,) with the oddity, if relations can be tested without them
+    size: float = 0.0  # `HELD`: seconds that a value lasts; `LIMIT`, `FAR`: the largest value
+    rows: Bools | None = None  # (N,) which rows are odd; None if relations cannot do without them
     note: str = ""
 
     @property
@@ -339,7 +339,7 @@ class Tally:
 
 
 def tallies(rows: FedRows) -> Iterator[Tally]:
-    """Count in one robot's rows all that is compared between robots."""
+    """Count the oddities in one robot's rows that are compared between robots."""
     copied: dict[str, Bools] = {}
     for signal, moves, same, note in _copies(rows):
         copied[signal] = same
@@ -487,9 +487,9 @@ def _compare_tallies(each: Sequence[dict[tuple[str, str], Tally]]) -> list[list[
 
 
 def _merge_tallies(each: Iterator[Tally]) -> dict[tuple[str, str], Tally]:
-    """Return tallies by kind and signal; of several with the same key, that of the largest share.
+    """Return tallies by kind and signal; of several with the same key, that with the largest share.
 
-    Its `rows` are the union of theirs.
+    The `rows` of this tally are the union of the rows of all of them.
     """
     found: dict[tuple[str, str], Tally] = {}
     for one in each:

@@ -36,18 +36,18 @@ from restock.train.judge.mission_checks import CHOSEN
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
 GOALS = "GOALS_OF_OTHERS"
-_FIRST = (  # if one is found, other checks of rows mean nothing
+_FIRST = (  # if one of these causes is found, other checks mean nothing
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
 # Checks of a signal's values. If several are off, the first explains the others.
 OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
-_PARTIAL = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; ties: the first
-_UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # kind -> its name in `Broken.mended`
-_ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # figure that should be 0
-_OPPOSITE, _STILL = -0.6, 0.3  # a scale below these is reversed, or stands still
-MENDED = 0.8  # least share of broken stretches that hold once a cause is undone
-CHANGED = "ACTIONS_CHANGED"  # then the profile is not to blame for anything that actions show
-COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion even if all else is right
+_PARTIAL = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; first wins ties
+_UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # kind of fault -> name in `Broken.mended`
+_ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # figure, if not 0 -> fault
+_OPPOSITE, _STILL = -0.6, 0.3  # signals with scales below these are reversed, or stand still
+MENDED = 0.8  # a cause counts if at least this share of broken stretches holds once it is undone
+CHANGED = "ACTIONS_CHANGED"  # if found, the profile is not to blame for any fault of the actions
+COARSE = "ACTIONS_COARSE"  # if found, actions explain less of the motion even if all else is right
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
 _UNITS = (
     ((50.0, 65.0), "degrees in place of radians"),
@@ -61,14 +61,14 @@ _UNITS = (
 class Finding:
     """A fault in the logs' rows."""
 
-    cause: str  # its name in docs and JSON
+    cause: str  # name of the cause in docs and JSON
     text: str  # what is wrong, and by how much
     remedy: str
     evidence: tuple[str, ...]  # the `check` of each comparison that shows it
 
 
 def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task) -> list[Finding]:
-    """Return the faults, the least understood last."""
+    """Return the faults that the checks show, the least understood last."""
     of_signals: dict[str, Comparison] = {}  # by `check`
     moved: list[Comparison] = []
     rest: list[Comparison] = []
@@ -88,7 +88,7 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     # Late or early actions look permuted, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
     changed = [one for one in of_rows if one.cause == CHANGED]
-    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # wrong wheels: their motion is unknown
+    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # motion is measured at the wheels
     if not changed and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
         changed = [_permutation(moved, task)]
     if changed:
@@ -96,7 +96,7 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
         ends.pop(PLAN, None)  # another goal explains the plan's scale
     if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows):
-        ends.pop(LIDAR, None)  # these causes explain it
+        ends.pop(LIDAR, None)  # these causes explain the lidar's relations
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
     found += changed + [_explain_end(end, off, task) for end, off in ends.items()]
@@ -113,7 +113,7 @@ def _signal_findings(
     if "EPISODES_REPEATED" in causes:
         return [], ()  # repeated episodes repeat every value
     if "LIDAR_OFF" in causes:
-        off.pop(ZEROS + LIDAR, None)  # too short ranges of near things become 0
+        off.pop(ZEROS + LIDAR, None)  # if ranges are too short, those to near things become 0
     by_end: dict[str, list[tuple[str, Comparison]]] = {}
     for check, row in off.items():
         kind = next(one for one in OF_SIGNALS if check.startswith(one))
@@ -121,7 +121,7 @@ def _signal_findings(
         if _repairs_relations(check, [one for one in answers if _uses_end(one, (end,))]):
             by_end.setdefault(end, []).append((kind, row))
     if POSE in by_end or POSE in odd_ends(answers):
-        by_end.pop(PLAN, None)  # it is measured from the pose
+        by_end.pop(PLAN, None)  # the plan is measured from the pose, so a wrong pose explains it
     shown, found = tuple(by_end), []
     if by_end.keys() >= set(GROUPS["wheels"]):
         by_end["wheels"] = by_end.pop(WHEEL_SPEED) + by_end.pop(WHEEL_TURN)
@@ -135,9 +135,9 @@ def _signal_findings(
 
 
 def _repairs_relations(check: str, answers: Sequence[Answer]) -> bool:
-    """Return whether most of the broken relations hold without the values that a check found.
+    """Return whether broken relations mostly hold without the odd values that a check found.
 
-    Also true if no relation tests this, and for copied and rounded values, which need no proof.
+    Also true if no relation can test this, and for copied or rounded values, which need no test.
     """
     broken = [one.broken.mended for one in answers if one.broken]
     shares = [mended[check][0] for mended in broken if check in mended]
@@ -145,7 +145,7 @@ def _repairs_relations(check: str, answers: Sequence[Answer]) -> bool:
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
-    """Return a small set of ends that covers all faulty relations: end -> relations it explains."""
+    """Return a small set of ends (signals) that explains all faulty relations: end -> relations."""
     left = [one for one in answers if one.off]
     fine = [one for one in answers if one.fine and one.relation.defined]
     names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
@@ -174,7 +174,7 @@ def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
     """Return the factor by which an end's values are scaled, and how many steps late they are."""
     ends = GROUPS.get(end, (end,))
     scales, delays = [], []
-    if any(one.is_off("delay") for one in off):  # scales are wrong in relations without a delay
+    if any(one.is_off("delay") for one in off):  # one lag cannot tell a delay from a scale
         off = [one for one in off if len(one.relation.lags) > 1]
     for one in off:
         is_answer = one.relation.y in ends
@@ -190,7 +190,7 @@ def _is_shift(scale: float, delay: float) -> bool:
 
 
 def _explain_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
-    """Return the cause which, once undone, makes an end's relations hold; else describe them."""
+    """Return the fault that, once undone, makes an end's relations hold; else describe them."""
     rows = [row for one in off for row in one.comparisons if row.off]
     named = {row.check.partition(":")[0]: row for row in reversed(rows)}  # figure -> its first row
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
@@ -239,15 +239,15 @@ def _constant_fault(
         return kind if _surely_reversed(off) else ""
     if _is_shift(scale, steps):
         return "shifted"
-    if scale != 1:  # a scale cannot mend an offset, and a lidar's scale cancels in its relations
+    if scale != 1:  # a scale cannot explain an offset, and a lidar's scale cancels in its relations
         return "scaled" if "offset" not in named and end != LIDAR else ""
     return next((kind for figure, kind in _ZEROS.items() if figure in named), "")
 
 
 def _shares_mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, float]]:
-    """Return the share of broken stretches that hold once each cause is undone, and its size.
+    """Return, by cause, the share of broken stretches that hold once it is undone, and its size.
 
-    Both are medians over the end's relations. Empty if no relation breaks in some stretches only.
+    Both are medians over the end's relations. Empty if no relation has too many broken stretches.
     """
     ends = GROUPS.get(end, (end,))
     found: dict[str, list[tuple[float, float]]] = {}
@@ -256,7 +256,7 @@ def _shares_mended(end: str, off: Sequence[Answer]) -> dict[str, tuple[float, fl
             continue
         for cause in _PARTIAL:
             share, by = one.broken.mended.get(cause, (0.0, 1.0))
-            if one.relation.y not in ends:  # the end is the relation's x
+            if one.relation.y not in ends:  # the end is x: its fault is the inverse
                 by = 1 / by if cause == "scaled" and by else -by
             found.setdefault(cause, []).append((share, by))
     return {
@@ -284,7 +284,7 @@ def _describe_mismatch(end: str, off: Sequence[Answer], named: Mapping[str, Comp
 
 
 def _surely_reversed(off: Sequence[Answer]) -> bool:
-    """Return whether all gains that are off are surely negative; noise makes some so by chance."""
+    """Return whether all gains that are off are surely negative, and not just by chance."""
     gains = [
         row for one in off for row in one.comparisons if row.off and row.check.startswith("gain")
     ]
@@ -307,7 +307,7 @@ def _permutation(moved: Sequence[Comparison], task: Task) -> Finding:
 def _row_findings(off: Sequence[Comparison]) -> list[Finding]:
     """Return the findings of checks that imply their cause; a check counts for one finding only."""
     left = {row.check: row for row in off}
-    if "driver" in left:  # the wrong driver also explains how many of its actions are proposals
+    if "driver" in left:  # a wrong driver also explains an odd share of proposals among actions
         left = {name: row for name, row in left.items() if not name.startswith(PROPOSED)}
     found: list[Finding] = []
     for kind in TABLES.kinds:
