@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
 
 
-MARGIN = 0.8  # how much better an expert's action must be (arXiv:1704.03732)
+MARGIN = 0.8  # by how much Q of an expert's action must exceed the others' (arXiv:1704.03732)
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class TrainingBatch:
     weight: Tensor | None = None  # (B,) importance weights; None: ones
     # (B, A) float32, added to Q(s', a) to choose the next action; None: nothing.
     preference: Tensor | None = None
-    lower: bool = False  # bootstrap from the lower of both networks' values
-    logged: int = 0  # L, how many of the first rows are from logs
-    conservative: float | Tensor = 0.0  # weight of the CQL term, or one per logged row (L,)
-    expert: Tensor | None = None  # (L,) bool, rows with the margin term; None: none
+    lower: bool = False  # bootstrap from min(Q, Q_target) instead of Q_target
+    logged: int = 0  # L, how many of the first rows the terms below apply to
+    conservative: float | Tensor = 0.0  # weight of the CQL term, or one weight per such row (L,)
+    expert: Tensor | None = None  # (L,) bool, which rows get the margin term; None: no row
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class Loss:
     value: Tensor  # () float32, with gradient
     td: Tensor  # (B,) float32, Q(s, a) - y, without gradient
     q: Tensor  # (B,) float32, Q(s, a), without gradient
-    penalty: Tensor | None = None  # () float32, minimised with `value`, not recorded
+    penalty: Tensor | None = None  # () float32, added to `value` for the gradient, not recorded
 
 
 class Algorithm(Protocol):
     """A way to learn action values, constructed from a run's `LossConfig`.
 
-    The greedy action has the network's largest value, after a teacher's preference, if any, is
-    added. The twin, evaluation and ONNX all use this rule.
+    The greedy action is the one whose value, plus the teacher's preference if there is a teacher,
+    is largest. The twin, evaluation and ONNX all use this rule.
     """
 
     def make_network(
@@ -88,8 +88,8 @@ class Algorithm(Protocol):
     def loss(self, network: Any, target: Any, batch: TrainingBatch) -> Loss:
         """Return the loss of `network` on a batch; `target` is its slow copy.
 
-        Both come from `make_network`. A compiled function with the same values and gradients may
-        take the place of a plain `QNetwork`.
+        Both networks come from `make_network`. Instead of a plain `QNetwork`, they may be compiled
+        functions with the same values and gradients.
         """
         ...
 
@@ -141,10 +141,10 @@ class DQN:
     def gradient(
         self, q: F32, scalars: F32, next_value: F32, weight: F32 | None
     ) -> tuple[Loss, F32]:
-        """Return the loss without penalty, and its gradient by `q` (B, A), as autograd rounds it.
+        """Return the loss without penalty, and its gradient by `q` (B, A), bit for bit autograd's.
 
-        `scalars` (B, 3) are action, reward and discount, `next_value` (B,) is the value of the next
-        action, `weight` (B,) importance weights; None: ones.
+        `scalars` (B, 3) has the columns action, reward and discount. `next_value` (B,) is the value
+        of the next action, `weight` (B,) has importance weights; None: ones.
         """
         chosen = np.arange(len(q)), scalars[:, 0].astype(np.int64)
         td = q[chosen] - (scalars[:, 1] + scalars[:, 2] * next_value)
@@ -159,7 +159,7 @@ class DQN:
         return Loss(loss.mean(), *of_rows), gradient
 
     def _penalty(self, q: Tensor, batch: TrainingBatch) -> Tensor | None:
-        """Return the terms on logged rows, times their share of the batch; None without terms."""
+        """Return the CQL and margin terms, times the share L / B of rows; None if both are off."""
         logged, share = batch.logged, batch.logged / len(q)
         action = batch.action[:logged]
         terms = []
@@ -188,7 +188,7 @@ def make_algorithm(config: LossConfig) -> Algorithm:
 
 
 def _import_named(source: str) -> Callable[[LossConfig], Algorithm]:
-    """Import `module:name`, also from the working directory."""
+    """Import `module:name`; modules in the working directory are found, too."""
     module, _, name = source.partition(":")
     folder = str(Path.cwd())
     sys.path.insert(0, folder)
@@ -233,9 +233,9 @@ def td_target(
         next_target_q: (B, A), the target network at s'.
         next_online_q: (B, A), the online network at s': it selects the action that the target
             network evaluates (Double DQN). None: the target network does both (DQN).
-        preference: (B, A), added to select the next action, but not to its value: -inf for actions
-            that may not be selected (discrete BCQ, arXiv:1910.01708). None: nothing.
-        lower: bootstrap from the lower of both networks' values.
+        preference: (B, A), added to the values that select the next action, not to the TD target;
+            -inf forbids an action (discrete BCQ, arXiv:1910.01708). None: nothing is added.
+        lower: bootstrap from min(Q, Q_target) of the next action instead of Q_target.
     """
     chooses = next_target_q if next_online_q is None else next_online_q
     if preference is not None:
@@ -259,7 +259,7 @@ def dqn_loss(
 
     `weight` (B,) are importance weights that correct the sampling; None: ones.
     """
-    chosen = q.gather(1, action.unsqueeze(1))  # (B, 1): fewer operations in the backward pass
+    chosen = q.gather(1, action.unsqueeze(1))  # kept as (B, 1): saves the backward pass operations
     wanted = target.unsqueeze(1)
     if weight is None:
         value = functional.huber_loss(chosen, wanted, delta=huber_delta)
@@ -283,9 +283,9 @@ def conservative_penalty(q: Tensor, action: Tensor, weight: float | Tensor = 1.0
 def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> Tensor:
     """Return DQfD's large-margin term, the mean of max_a [Q(s, a) + l(a)] - Q(s, a_E).
 
-    l(a) is `margin` for every action but the expert's, so that the expert's must be better by that
-    much (arXiv:1704.03732, equation 1). `expert` (B,) bool marks the expert's rows. The mean is
-    over all B rows, so the term is small in a batch with few of them.
+    l(a) is 0 for the expert's action a_E and `margin` for all others, so Q of a_E must be larger by
+    `margin` (arXiv:1704.03732, equation 1). `expert` (B,) bool marks the expert's rows. The mean is
+    over all B rows, so the term is small in a batch with few expert rows.
     """
     others = torch.full_like(q, margin).scatter_(1, action.unsqueeze(1), 0.0)
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)

@@ -46,7 +46,7 @@ Values = QNetwork | Ensemble
 UNKNOWN = -1  # code of the action if the teacher was not queried or had no opinion
 HIDDEN = (256, 256)  # widths of the behaviour network's layers
 _LEARNING_RATE = 1e-3
-_SEED = 1 << 32  # added to the run's seed: larger than any seed of Q
+_SEED = 1 << 32  # added to the run's seed, so that no Q network is initialised with the sum
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
 
     Args:
         logits: (B, A), of which G is the softmax.
-        ratio: () from 0 (all of them) to 1 (the likeliest alone).
+        ratio: () from 0 (every action is plausible) to 1 (only the likeliest one is).
     """
     return logits >= logits.amax(dim=1, keepdim=True) + ratio.log().to(logits.dtype)
 
 
 def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
-    """Return the mean of -log G(a|s), (), over rows (M,) with a known action; 0 without any."""
+    """Return the mean of -log G(a|s) over the rows (M,) with a known action; 0 if none has one."""
     known = action != UNKNOWN
     losses = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
     return losses.sum() / known.sum().clamp_min(1)
@@ -92,8 +92,8 @@ class FilteredNetwork(nn.Module):
         return q.masked_fill(~plausible, -torch.inf)
 
 
-# How to read a proposal from an observation o (D,): W (A, D) and b (A,), with W @ o + b largest for
-# the proposed action; and k (D,), with k @ o = 1 if there is a proposal, else 0.
+# Arrays W (A, D), b (A,) and k (D,) that read navigation's proposal from an observation o (D,):
+# W @ o + b is largest for the proposed action; k @ o is 1 if there is a proposal, else 0.
 Proposal = tuple[F64, F64, F64]
 
 
@@ -101,11 +101,11 @@ class ProposalNetwork(nn.Module):
     """A network that gives Q, plus `margin` for the action that navigation proposes, if any."""
 
     nearest: Tensor  # (A, D), W of `Proposal`
-    offset: Tensor  # (A,), b
-    lead: Tensor  # (D,), margin * k
+    offset: Tensor  # (A,), b of `Proposal`
+    lead: Tensor  # (D,), margin * k of `Proposal`
 
     def __init__(self, values: Values, proposal: Proposal | None, margin: float) -> None:
-        """Without a `proposal`, the buffers are 0 until kept weights are loaded."""
+        """Build the network; without a `proposal`, its buffers are 0 until weights are loaded."""
         super().__init__()
         self.values = values
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -145,7 +145,7 @@ def make_behaviour(
 def make_policy(
     config: TrainConfig, observation_size: int, actions: int, *, runs: int = 1
 ) -> PolicyNetwork:
-    """Return the policy network of a run, or of a mean of `runs`, to load kept weights into."""
+    """Return a network to load the weights of a policy into, or of a mean of several `runs`."""
     values = _combine_runs([make_network(config, observation_size, actions) for _ in range(runs)])
     if config.teacher.source == PLANNER:
         return ProposalNetwork(values, None, config.teacher.margin)
@@ -160,9 +160,9 @@ def _combine_runs(networks: Sequence[QNetwork]) -> Values:
 
 
 class Behaviour(Stateful):
-    """The behaviour network with its optimizer and the ratio.
+    """The behaviour network, its optimizer, and the ratio that decides which actions are plausible.
 
-    `average` is a network with the average of its weights, which is evaluated and kept.
+    `average` is a copy of the network with the average of its weights: it is evaluated and kept.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates")
@@ -186,7 +186,7 @@ class Behaviour(Stateful):
         self._logits = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.tensor(config.ratio, device=device)
-        self._floor = np.float32(self.ratio.log().cpu())  # plausible: logit >= largest + floor
+        self._floor = np.float32(self.ratio.log().cpu())  # plausible: logit >= largest logit + this
 
     def learn(self, labelled: Labelled) -> None:
         """Make one gradient step."""
@@ -196,7 +196,7 @@ class Behaviour(Stateful):
         self.optimizer.step(self._slow, averaging_rate(self.updates))
 
     def move(self, labelled: Labelled, rate: Tensor) -> None:
-        """Make one gradient step by operations on the device alone; `count` counts it."""
+        """Make one gradient step by operations on the device alone, without counting it."""
         self._fill_gradient(labelled)
         self.optimizer.move(self._slow, rate)
 
@@ -217,7 +217,7 @@ class Behaviour(Stateful):
         return np.asarray(logits >= logits.max(axis=1, keepdims=True) + self._floor)
 
     def _fill_gradient(self, labelled: Labelled) -> None:
-        if isinstance(self._logits, Kernel):  # bit for bit the gradient that autograd computes
+        if isinstance(self._logits, Kernel):  # the same bits as autograd's, see below
             logits = torch.from_numpy(self._logits.values(labelled.observation.numpy()))
             likely, action = torch.log_softmax(logits, dim=1), labelled.action.numpy()
             known = np.flatnonzero(action != UNKNOWN)

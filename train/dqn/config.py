@@ -25,14 +25,14 @@ from restock.train.twin.missions import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
 GIVEN = "given"  # `teacher.source` of a teacher that Python code passed in
-PLANNER = "planner"  # `teacher.source` if navigation's proposal, in the observation, teaches
+PLANNER = "planner"  # `teacher.source` if the teacher is navigation's proposal in the observation
 
 Count = Annotated[int, Meta(ge=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
-LAST_SEED = 2**31 - 1  # the largest that all generators of the twin and of the libraries accept
+LAST_SEED = 2**31 - 1  # the largest seed that all generators of the twin and libraries accept
 Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 
 
@@ -48,7 +48,7 @@ class NetworkConfig(Checked, frozen=True):
 class LossConfig(Checked, frozen=True):
     algorithm: str = "dqn"  # or your own, as module:name; docs/extending.md
     discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must equal the panel's
-    n_step: Count = 3  # steps of fresh rows' returns; the panel has its own
+    n_step: Count = 3  # of fresh rows; logged rows keep the n_step of their panel
     double: bool = True
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
     # Weight of the CQL term on logged rows while offline; online it falls linearly to 0.
@@ -63,7 +63,7 @@ class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
 
     @property
     def effective_lag(self) -> float:
-        """Return the mean age of the target in updates: C / 2."""
+        """Return the mean age of the target in updates: every / 2."""
         return self.every / 2
 
     def __str__(self) -> str:
@@ -98,7 +98,7 @@ class OptimizerConfig(Checked, frozen=True):
 
 class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
-    logs_share: Share | None = None  # share of each online batch; None: the mixture's
+    logs_share: Share | None = None  # logged rows' share of online batches; None: the mixture's
     ring_capacity: int = 100_000  # fresh rows kept
     ring_reserved: Share = 0.0  # share of the ring reserved for conditions, in equal parts
 
@@ -111,7 +111,7 @@ class ReplayConfig(Checked, frozen=True):
 
 
 class ScheduleConfig(Checked, frozen=True):
-    env_steps: NonNegativeInt = 200_000  # budget, over all environments
+    env_steps: NonNegativeInt = 200_000  # budget in steps, summed over all environments
     seconds: Positive | None = None  # stop after this training time, if earlier
     offline_updates: NonNegativeInt = 2_000  # updates on the panel alone, before any driving
     warmup_env_steps: NonNegativeInt = 2_000  # rollouts before the first online update
@@ -121,22 +121,22 @@ class ScheduleConfig(Checked, frozen=True):
 class TeacherConfig(Checked, frozen=True):
     """The teacher, and how far the policy may deviate from its actions."""
 
-    # operator: of the twin; planner: what navigation proposes, unless Q of another action is larger
-    # by more than `margin`; logs: only cloned rows; none; or your own, as module:name.
-    # None: the operator if the task has a goal, else none.
+    # "operator": the twin's operator. "planner": navigation's proposal, unless Q of another action
+    # is larger by more than `margin`. "logs": only the cloned rows. "none". Or your own teacher, as
+    # module:name. None: "operator" if the task has a goal, else "none".
     source: str | None = None
-    margin: NonNegative = 0.2  # reward by which another action must be better than the planner's
-    ratio: Share = 0.3  # plausible: G(a|s) >= ratio * max G
-    policies: tuple[str, ...] = ("operator",)  # drivers whose rows are cloned, or have loss.margin
-    # Also clone other drivers' episodes that reached their goal without one of `policies`: before
-    # the first environment step, and to the end if no teacher is queried in the twin.
+    margin: NonNegative = 0.2  # by how much Q of another action must exceed Q of the proposal
+    ratio: Share = 0.3  # an action is plausible if G(a|s) >= ratio * max G
+    policies: tuple[str, ...] = ("operator",)  # drivers to clone, and to apply loss.margin to
+    # Also clone episodes that reached their goal and that no driver of `policies` drove: until the
+    # first environment step, or in the whole run if no teacher is queried in the twin.
     # None: true if goals are logged and no teacher is queried in the twin.
     successes: bool | None = None
-    # Updates of the behaviour network on cloned rows, before the critic's first update. None:
-    # `schedule.offline_updates`, times the rows / 5,000 if there are more, at most ten times.
+    # Updates of the behaviour network on cloned rows, before the critic's first update.
+    # None: `schedule.offline_updates`, times (cloned rows / 5,000) limited to 1 to 10.
     offline_updates: NonNegativeInt | None = None
-    # Draw half of the behaviour network's rows as their mirror image: only for a teacher who keeps
-    # to no side. None: true if the twin's operator teaches and each action has its opposite.
+    # Mirror half of the behaviour network's rows, left to right. This suits only a teacher without
+    # a preferred side. None: true if the twin's operator teaches and each action has its opposite.
     mirror: bool | None = None
 
     @property
@@ -161,7 +161,7 @@ class TeacherConfig(Checked, frozen=True):
 class EnvConfig(Checked, frozen=True):
     twin: bool = True  # false: train on logs alone, keep the last policy
     num_envs: Count = 32
-    # Shares of true conditions among the episodes of the twin.
+    # Shares of the twin's episodes by condition: by the kind of mission that the twin sets up.
     conditions: dict[str, NonNegative] = msgspec.field(
         default_factory=lambda: dict(DEFAULT_CONDITIONS)
     )
@@ -180,7 +180,7 @@ class EnvConfig(Checked, frozen=True):
 
 
 class PracticeConfig(Checked, frozen=True):
-    """The choice of the missions that the twin gives next: see `restock.train.feed.practice`."""
+    """How the twin's next missions are chosen: see `restock.train.feed.practice`."""
 
     rule: Literal["natural", "even", "success"] = "natural"
 
@@ -189,15 +189,15 @@ class EvaluationConfig(Checked, frozen=True):
     every_env_steps: Count = 20_000
     episodes: Count = 10  # episodes per condition
     seed: Seed = 90_000  # seed of the first fixed episode; not used in training
-    layouts: str | None = None  # None: env.layouts (generated:train: its validation floors)
-    off_policy: bool = False  # evaluate the offline policy on logs, before it drives
+    layouts: str | None = None  # None: env.layouts, or the validation floors of generated:train
+    off_policy: bool = False  # evaluate the policy on held-out logs before it drives
 
 
 class RecordConfig(Checked, frozen=True):
     every_updates: Count = 500  # length of a logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
     checkpoint_every_env_steps: Count = 40_000
-    trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # get curves
+    trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # for curves
 
 
 class TrainConfig(Checked, frozen=True):
@@ -238,7 +238,7 @@ def has_effect(config: TrainConfig, key: str) -> bool:
 
 
 def refuse_untaught(config: TrainConfig, *, within: str = "") -> None:
-    """Raise ConfigError if a setting of the teacher is given that its source does not use."""
+    """Raise ConfigError if a given setting of the teacher has no effect with its source."""
     source = config.teacher.source
     given = changed(config.teacher, source=source)
     if idle := [key for key in given if not has_effect(config, key)]:
@@ -263,7 +263,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     applied = apply_overrides(document, overrides)
     try:
         return parse_config(applied, where=f"{path} and --set")
-    except ConfigError:  # name the file or --set alone, if it is wrong without the other
+    except ConfigError:  # if the file or --set is wrong by itself, raise its error instead
         parse_config(document, where=str(path))
         parse_config(apply_overrides({}, overrides), where="--set")
         raise
@@ -284,7 +284,7 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return nested settings as a list of `key.path=value` for `apply_overrides`."""
     overrides = []
     for key, value in document.items():
-        # A target rule is one value: half of one and half of another is invalid.
+        # Keep a target rule as one value: keys of two rules must not be merged.
         if isinstance(value, Mapping) and prefix + key != "target":
             overrides += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:
@@ -329,7 +329,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text  # a bare word is a string
     *sections, last = key.strip().split(".")
-    if sections == ["target"]:  # a setting of the default rule, unless a rule is named
+    if sections == ["target"]:  # the default rule, unless a rule is given
         document.setdefault("target", {"rule": msgspec.to_builtins(TrainConfig().target)["rule"]})
     for section in sections:
         document = document.setdefault(section, {})

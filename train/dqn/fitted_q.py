@@ -41,7 +41,7 @@ class Transitions:
 class FittedQConfig:
     """The settings of a fit."""
 
-    iterations: int = 240  # also the steps that it looks ahead: the warehouse task's time limit
+    iterations: int = 240  # also the horizon in steps; default: the warehouse task's time limit
     updates: int = 25  # gradient steps per iteration
     batch_size: int = 256
     hidden: Sequence[int] = (128, 128)
@@ -51,10 +51,10 @@ class FittedQConfig:
 
 
 def soft_greedy(network: PolicyNetwork, observation: F32, epsilon: float) -> F32:
-    """Return the probabilities (N, A) of the greedy policy that acts at random with `epsilon`.
+    """Return the action probabilities (N, A) of the epsilon-greedy policy.
 
-    A deterministic policy gives all other actions probability 0, so an episode in which the logs
-    took another action just once would have no weight.
+    With `epsilon` 0, an episode in which the logs took one action that is not greedy would have
+    importance weight 0.
     """
     q = values(network, observation)
     probability = np.full(q.shape, epsilon / q.shape[1], np.float32)
@@ -77,10 +77,10 @@ def fitted_q(
     Args:
         rows: the logged transitions.
         next_probability: (N, A) the policy's probability of each action in `next_observation`.
-        discount: per step.
-        bounds: lower and upper bound of every value.
+        discount: discount factor per step.
+        bounds: lower and upper limit that TD targets are clipped to; None: no limits.
         seed: of the initial weights and of the batches.
-        between: called before every update; what it raises ends the fit.
+        between: called before every update; an exception that it raises ends the fit.
     """
     actions = next_probability.shape[1]
     generator = torch.Generator().manual_seed(seed)
@@ -128,8 +128,8 @@ def cloned_behaviour(
 ) -> QNetwork:
     """Fit a network whose softmax is the probability with which the logs chose each action.
 
-    This is for logs without action probabilities; importance weights from it are estimates.
-    `between` is called before every update; what it raises ends the fit.
+    Use it for logs without action probabilities; importance weights from it are estimates.
+    `between` is called before every update; an exception that it raises ends the fit.
     """
     generator = torch.Generator().manual_seed(seed)
     network = QNetwork(

@@ -45,9 +45,9 @@ class Terms:
     """Arguments of an update besides the rows (B, W)."""
 
     weight: Tensor | None  # (B,) importance weights; None: ones
-    logged: int  # how many of the first rows the terms below apply to
-    conservative: float | Tensor  # weight of the CQL term, or one per such row (logged,)
-    expert: Tensor | None  # (logged,) bool
+    logged: int  # how many of the first rows the two terms below apply to
+    conservative: float | Tensor  # weight of the CQL term, or one weight per such row (logged,)
+    expert: Tensor | None  # (logged,) bool, rows that get the margin term; None: no row
 
 
 class Learner(Stateful):
@@ -79,8 +79,8 @@ class Learner(Stateful):
         """Build the networks.
 
         Args:
-            path: None chooses the fastest allowed; paths agree up to rounding.
-            proposal: how the task's observations show navigation's proposal, if that teaches.
+            path: how gradients are computed, which changes only rounding; None: the fastest way.
+            proposal: reads navigation's proposal from observations, if the proposal is the teacher.
         """
         self.device = open_device(config.device)
         self.algorithm = make_algorithm(config.loss)
@@ -98,7 +98,7 @@ class Learner(Stateful):
         self._slow = FlatParameters(self.target_network, learns=False).values
         self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
         learns = self.optimizer
-        # The networks that the loss is computed with, or kernels in their place.
+        # Both networks as the loss calls them, replaced by kernels if there are any.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
         self._target = differentiable(self.path, self.target_network, self._slow)
         self._has_kernels = type(self.algorithm) is DQN and type(self._online) is Kernel
@@ -141,9 +141,9 @@ class Learner(Stateful):
         Args:
             rows: (B, 2D + 3) float32, on the learner's device.
             weight: (B,) importance weights, or None for ones.
-            logged: how many of the first rows are from logs; the conservative term sees only those.
-            conservative: the weight of that term.
-            expert: (logged,) bool, whether the margin term applies; None: to no row.
+            logged: how many of the first rows are from logs; the CQL term applies only to those.
+            conservative: the weight of the CQL term.
+            expert: (logged,) bool, which rows the margin term applies to; None: no row.
             labelled: a batch for the behaviour network, if there is one.
         """
         terms = Terms(weight, logged, conservative if logged else 0.0, expert)
@@ -151,7 +151,7 @@ class Learner(Stateful):
         fill = self._fill_by_kernels if is_plain and self._has_kernels else self._fill_gradient
         loss = fill(rows, terms)
         self.gradient_steps += 1
-        # `policy_network`, which is evaluated and kept, follows as an average of weights.
+        # This also moves the average of weights, `policy_network`, which is evaluated and kept.
         self.optimizer.step(self._policy, averaging_rate(self.gradient_steps))
         if self.behaviour is not None and labelled is not None:
             self.behaviour.learn(labelled)
@@ -167,8 +167,8 @@ class Learner(Stateful):
     ) -> Loss:
         """Make an update by operations on the device alone, which a CUDA graph can repeat.
 
-        A Polyak target is moved, too. `rate` and `behaviour_rate`, (), are those of the averages of
-        weights. The caller counts the update by `count`.
+        A Polyak target is moved, too. `rate` and `behaviour_rate`, (), are the averaging rates of
+        the weights of Q and of the behaviour network. The caller counts the update by `count`.
         """
         loss = self._fill_gradient(rows, terms)
         self.optimizer.move(self._policy, rate)
@@ -201,7 +201,7 @@ class Learner(Stateful):
         return Loss(loss.value.detach(), loss.td, loss.q)
 
     def _fill_by_kernels(self, rows: Tensor, terms: Terms) -> Loss:
-        """Do as `_fill_gradient`, for DQN without terms on logged rows: same bits, fewer calls."""
+        """Fill the gradient by kernels, bit for bit the same, for DQN without CQL and margin."""
         parts = self._online, self._target, self.algorithm
         online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
         packed, count, size = rows.numpy(), len(rows), self.network.observation_size
@@ -238,7 +238,7 @@ class Learner(Stateful):
 
     @property
     def is_finite(self) -> bool:
-        """Return whether all parameters are finite; a gradient that is not finite spoils them."""
+        """Return whether all parameters are finite; a NaN or infinite gradient makes them NaN."""
         of_values = [self.optimizer.values]
         if self.behaviour is not None:
             of_values.append(self.behaviour.optimizer.values)
@@ -248,7 +248,7 @@ class Learner(Stateful):
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return Q(s, a) - y (B,), Q(s) (B, A) and Q_target(s) (B, A) of rows, without learning.
 
-        With `online`, the online network bootstraps y, as if the target did not lag.
+        With `online`, the target y is computed with the online network, as if there were no lag.
         """
         batch = self._batch(rows, Terms(None, 0, 0.0, None))
         slow = self.network if online else self.target_network
@@ -269,7 +269,7 @@ class TargetUpdate(Stateful):
         self, rule: TargetRule, online: Iterable[torch.Tensor], target: Iterable[torch.Tensor]
     ) -> None:
         self.rule = rule
-        self.last_sync = 0  # the update after which the target last moved
+        self.last_sync = 0  # number of the last update after which the target moved
         self._online = list(online)
         self._target = list(target)
 
@@ -279,7 +279,7 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:
-        """Move the target after update number `gradient_step` (from 1) if due; return whether.
+        """Move the target if due after update `gradient_step` (from 1); return whether it moved.
 
         Do nothing if the target has already moved for this update, as in `Learner.move`.
         """

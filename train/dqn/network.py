@@ -56,7 +56,7 @@ class QNetwork(nn.Module):
         self._initialise(generator)
 
     def _initialise(self, generator: torch.Generator | None) -> None:
-        """Initialise a Linear layer as PyTorch does, but from our own generator."""
+        """Initialise all Linear layers as PyTorch does by default, but from `generator`."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 bound = module.in_features**-0.5
@@ -109,7 +109,7 @@ def clone(network: N) -> N:
 def torch_threads(number: int) -> Iterator[None]:
     """Set the number of torch's CPU threads while the block runs.
 
-    Networks of this size are slower on several, and much slower if other processes use the cores.
+    Small networks are slower on several threads, and much slower if other processes use the cores.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(number)
@@ -130,7 +130,7 @@ class Differentiable(Protocol):
         ...
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Reset the gradient; False keeps its memory."""
+        """Reset the gradient; `set_to_none=False` keeps its tensors allocated."""
         ...
 
 
@@ -152,8 +152,8 @@ def differentiable(
     Args:
         path: "native" for a kernel; only a plain `QNetwork` has one.
         network: a network whose parameters `FlatParameters` moved into `values`.
-        values: all parameters.
-        gradient: their gradients; None if the network does not learn.
+        values: all parameters, flat.
+        gradient: the gradients of all parameters, flat; None if the network does not learn.
     """
     if path == "native" and type(network) is QNetwork:
         return Kernel(network, values, gradient)
@@ -163,13 +163,13 @@ def differentiable(
 class Kernel:
     """A compiled plain `QNetwork`, from observations (B, D) to action values (B, A).
 
-    Gradients are added up until `zero_grad`, as autograd does. One thread at a time may use it;
-    while it computes, other threads run.
+    Gradients add up until `zero_grad`, as in autograd. Only one thread at a time may call a kernel,
+    but other Python threads can run while it computes.
 
     Args:
         network: float32 on the CPU, its parameters moved into `values` by `FlatParameters`.
-        values: all parameters.
-        gradient: receives their gradients; None if the network does not learn.
+        values: all parameters, flat.
+        gradient: receives the parameters' gradients; None if the network does not learn.
         wide: whether AVX-512 may be used; the result is the same.
     """
 
@@ -187,7 +187,7 @@ class Kernel:
         self._actions = network.actions
         self._gradient = gradient
         self._adds = False  # whether the next backward pass adds to the gradient or overwrites it
-        self._passes = 0  # forward passes so far: only the last can be differentiated
+        self._passes = 0  # forward passes so far; only the last one's activations are stored
         self._network = native.compiled.Network(
             (network.observation_size, *widths, network.actions),
             norms[0] if norms else -1.0,
@@ -214,20 +214,20 @@ class Kernel:
         self._adds = False
 
     def values(self, *observation: F32) -> F32:
-        """Return action values (n B, A) of n observations (B, D), outside of autograd."""
+        """Return action values (n * B, A) of n arrays of observations (B, D), outside autograd."""
         out = np.empty((len(observation) * len(observation[0]), self._actions), np.float32)
         self._network.forward(observation, out)
         self._passes += 1
         return out
 
     def descend(self, gradient: F32) -> None:
-        """Compute the parameters' gradient, given that of the last pass's first values (B, A)."""
+        """Compute the parameters' gradient from that of the last pass's first B rows of values."""
         self._network.backward(gradient)
 
     def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:
         assert self._gradient is not None
         assert gradient is not None
-        if made_by != self._passes:  # a later pass has overwritten this one's activations
+        if made_by != self._passes:  # a later pass overwrote the activations: repeat this pass
             self.values(observation.numpy())
         earlier = self._gradient.clone() if self._adds else None
         self.descend(gradient.contiguous().numpy())
@@ -236,19 +236,19 @@ class Kernel:
         self._adds = True
 
 
-_ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
-_SLICE = 4096  # elements per tensor of Adam on a GPU: one large tensor would occupy two blocks
+_ALIGNMENT = 16  # elements, a cache line: every parameter begins on one, as its own tensor would
+_SLICE = 4096  # elements per slice for Adam on a GPU, which would run in two blocks if not sliced
 
 
 class FlatParameters:
     """The parameters of `network`, moved into `values`; their gradients are views of `gradient`.
 
-    `load_state_dict` and in-place writes go through the views. Replacing a parameter's `.data`, as
-    `Module.to` does, breaks them: do it before.
+    Parameters become views, so `load_state_dict` and in-place writes change `values`. Replacing a
+    parameter's `.data`, as `Module.to` does, ends that: call `Module.to` before.
 
     Args:
-        network: whose parameters are moved.
-        learns: whether they have gradients; else `gradient` is empty.
+        network: the network whose parameters are moved.
+        learns: whether the parameters have gradients; if not, `gradient` is empty.
     """
 
     def __init__(self, network: nn.Module, *, learns: bool) -> None:
@@ -276,15 +276,15 @@ class FlatParameters:
         ]
 
     def flat_of(self, pieces: list[Tensor]) -> Tensor:
-        """Return a new flat tensor whose `views` are these pieces, with 0 between them."""
+        """Return a new flat tensor whose `views` are these pieces, with 0 in the padding."""
         flat = torch.zeros_like(self.values)
         for view, piece in zip(self.views(flat), pieces, strict=True):
             view.copy_(piece)
         return flat
 
 
-_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
-_BETAS, _EPS = (0.9, 0.999), 1e-8  # Adam's
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # PyTorch's names of Adam's two moments
+_BETAS, _EPS = (0.9, 0.999), 1e-8  # PyTorch's defaults for Adam
 
 
 AVERAGING = 0.001  # rate of the average of weights that is evaluated and kept
@@ -295,7 +295,7 @@ def averaging_rate(steps: int) -> float:
 
     The greedy policy of a single update is noisy: a small change of values changes many actions at
     once. The average over about the last 1 / AVERAGING updates is not (Polyak and Juditsky 1992).
-    While there are fewer updates, it is the mean of all of them.
+    Before there are that many updates, the average is the mean over all of them.
     """
     return max(AVERAGING, 1.0 / steps)
 
@@ -303,13 +303,13 @@ def averaging_rate(steps: int) -> float:
 class FlatAdam(Stateful):
     """Adam on all parameters of `network` as one tensor.
 
-    It calls the function behind `torch.optim.Adam(fused=True)` and gives the same bits. The class
-    itself would spend a fifth of each step on hooks, groups and schedules, which are unused here.
+    It calls the function behind `torch.optim.Adam(fused=True)` and gives the same bits. That class
+    spends a fifth of each step on hooks, groups and schedules, which are unused here.
 
     Args:
         network: its parameters are moved into `values`, their gradients into `gradient`.
-        learning_rate: Adam's.
-        compiled: use the compiled step: the same bits in one pass over memory, average included.
+        compiled: make steps by compiled code: the same bits in one pass over memory, which also
+            moves the average of weights.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("moments",)
@@ -324,9 +324,9 @@ class FlatAdam(Stateful):
         self._flat = FlatParameters(network, learns=True)
         self.values, self.gradient = self._flat.values, self._flat.gradient
         self.learning_rate, self._compiled = learning_rate, compiled
-        # Only written in place from here on, because a CUDA graph refers to these tensors.
+        # From here on, write these tensors only in place: a CUDA graph refers to them.
         self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
-        # The arguments of `adam`, which counts steps per tensor: one on the CPU, slices on a GPU.
+        # Lists for `adam`: whole tensors on the CPU, slices on a GPU; `_step` has a count for each.
         device = self.values.device
         size = len(self.values) if device.type == "cpu" else _SLICE
         whole = (self.values, self.gradient, *self._moments)
