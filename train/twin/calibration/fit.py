@@ -71,12 +71,12 @@ class FitConfig:
     """Settings of a fit. The same values give the same result. Raises ConfigError if invalid."""
 
     parameters: tuple[str, ...] = DEFAULT
-    recordings: tuple[str, ...] = ()  # of the store; empty: all
+    recordings: tuple[str, ...] = ()  # IDs of the recordings to fit; empty: all of the store
     task_hash: str | None = None  # needed if the store has rows of several tasks
-    horizon_s: float = 3.0  # of the segments that are fitted
-    held_out: float = 0.25  # share of the log on which the gap is measured
-    search_points: int = 64  # of the coarse search
-    max_segments: int = 200  # of more segments, this many are drawn
+    horizon_s: float = 3.0  # length of the fitted segments
+    held_out: float = 0.25  # share of the log that is not fitted, but used to measure the gap
+    search_points: int = 64  # number of points that the coarse search tries
+    max_segments: int = 200  # if the log has more, this many are drawn at random
     seed: int = 0
     nthread: int = 1  # 0: every core
     name: str = "fitted"
@@ -100,13 +100,13 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class _FitData:
-    """The data of a fit: the segments to fit, and what the held-out ones are cut from."""
+    """The data of a fit: the steps, the segments to fit, and where each held-out part begins."""
 
     steps: LoggedSteps
-    recordings: tuple[str, ...]  # that have segments
+    recordings: tuple[str, ...]  # IDs of the recordings that have segments
     segments: LoggedSegments  # to fit
     held_out_from_ns: dict[str, int]  # recording -> time from which it is held out
-    left_out: dict[str, int]  # reason -> segments or steps
+    left_out: dict[str, int]  # reason -> number of segments or steps left out
 
 
 def fit(
@@ -161,7 +161,7 @@ def fit(
 
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
-    """Cut and draw at most `max_segments` segments of ordinary driving, not held out."""
+    """Cut segments; draw at most `max_segments` with ordinary driving that are not held out."""
     steps = logged_steps(store, config.task_hash, config.recordings)
     segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
@@ -195,7 +195,7 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
 def _search(
     residuals: ReplayResiduals, coordinates: Coordinates, config: FitConfig, report: Report
 ) -> F64:
-    """Search the whole ranges with few segments; return the best point (n,)."""
+    """Search the whole ranges of the parameters with few segments; return the best point (n,)."""
     report(f"searching {config.search_points} points on {len(residuals.segments)} segments")
     scale = {name: CHANNELS[name][1] for name in residuals.channels}
     problem = FitProblem(residuals, coordinates, scale)

@@ -41,7 +41,7 @@ CHANNELS: dict[str, tuple[str, float]] = {
     "heading": ("rad", 0.02),
 }
 _ODOMETRY = "nav_msgs/msg/Odometry"
-_GOAL = "geometry_msgs/msg/PoseStamped"  # used for goals as often as by localisers
+_GOAL = "geometry_msgs/msg/PoseStamped"  # does not prove a localiser: goals have this type, too
 _POSE_TYPES = (
     "PoseWithCovarianceStamped",
     "PoseStamped",
@@ -57,8 +57,8 @@ class Parameter:
 
     name: str
     unit: str
-    step: float  # of a difference quotient; relative for a `ratio`
-    useful: float  # widest useful half of a 95 % interval; for a `ratio`, of its logarithm
+    step: float  # step size of its difference quotient; relative for a `ratio`
+    useful: float  # half width of the widest useful 95 % interval; of the logarithm for a `ratio`
     ratio: bool = False  # searched by its logarithm
     default: bool = True  # fitted unless others are requested
     own_body: bool = False  # only meaningful if the log's robot has the twin's body
@@ -71,9 +71,9 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("friction_scale", "", 0.04, 0.4, ratio=True, own_body=True),
         Parameter("left_friction_scale", "", 0.04, 0.4, ratio=True, own_body=True, default=False),
         Parameter("payload_kg", "kg", 2.0, 20.0, own_body=True),  # identified when speeds change
-        Parameter("wheel_radius_scale", "", 0.004, 0.02),  # distance over ground by that of wheels
-        Parameter("track_scale", "", 0.004, 0.02),  # turn over ground by that of the wheels
-        Parameter("latency_s", "s", 0.01, 0.03),  # from an observation to the wheels' set point
+        Parameter("wheel_radius_scale", "", 0.004, 0.02),  # distance driven ÷ wheels' distance
+        Parameter("track_scale", "", 0.004, 0.02),  # angle turned ÷ angle that the wheels report
+        Parameter("latency_s", "s", 0.01, 0.03),  # delay from observation to wheels' set point
         Parameter("gain", "", 0.005, 0.02),  # wheel speed ÷ commanded speed
         Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01),  # the gyroscope's reading at rest
     )
@@ -92,7 +92,7 @@ class Coordinates:
         self.names, self.task = tuple(names), task
         self.parameters = [PARAMETERS[name] for name in names]
         ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
-        if "latency_s" in self.names:  # the twin keeps only four commands to delay
+        if "latency_s" in self.names:  # at most four control periods are searched
             most = min(RANGES["latency_s"][1], 4 * task.control_period_s)
             ends[self.names.index("latency_s"), 1] = most
         self._ratio = np.array([item.ratio for item in self.parameters], np.bool_)
@@ -125,7 +125,7 @@ class Coordinates:
 
     def perturbation(self, z: F64) -> Perturbation:
         """Return the perturbation at a point (n,)."""
-        # Rounded so that equal points give equal perturbations, and ends of ranges stay inside.
+        # Rounded so that equal points give equal perturbations, and values stay in their ranges.
         values = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
         return msgspec.structs.replace(BASE, **values)
 
@@ -145,7 +145,7 @@ class Coordinates:
 
 @dataclass(frozen=True)
 class FitScope:
-    """The parameters and channels that a log can identify, and the reasons against the others."""
+    """The parameters and channels that a log can identify, and why others are left out."""
 
     names: tuple[str, ...]
     channels: tuple[str, ...]
@@ -160,12 +160,12 @@ def fit_scope(
     recordings: Sequence[str],
     robot: Robot | None = None,
 ) -> FitScope:
-    """Return which of `names` these recordings can identify at all; no recordings means all.
+    """Return which parameters `names` these recordings (empty: all) can identify at all.
 
-    `robot` is the profile's; None: the twin drives its stand-in for the log's robot.
+    `robot` is that of the profile. If it is None, the twin's stand-in replays the log.
 
     Raises:
-        ConfigError: they can identify none of the parameters.
+        ConfigError: the recordings can identify none of the parameters.
     """
     refused: dict[str, str] = {}
     notes: list[str] = []
@@ -239,7 +239,7 @@ def _recording_filter(recordings: Sequence[str]) -> str:
 
 
 def pose_is_odometry(store: Store, recordings: Sequence[str]) -> bool:
-    """Return whether all these recordings were read with odometry but without a localiser."""
+    """Return whether ingest read odometry but no localiser in each of these recordings."""
     wanted = _recording_filter(recordings)
     rows = store.sql(
         "SELECT recording_id, coalesce(list(DISTINCT type) FILTER (decoded > 0), [])"
@@ -252,10 +252,10 @@ def pose_is_odometry(store: Store, recordings: Sequence[str]) -> bool:
 
 
 _KEPT = 512  # replays that are cached
-ENOUGH = 0.02  # gain in cost that ends the solver: that of a fifth of a standard deviation
-FREE = 0.01  # regulariser up to which a step is hardly held back, as the Hessian's diagonal is ~1
-SOFT = 2.0  # residuals above this many noises count linearly
-# Lower limits of the noise. Residuals of an exact simulator come from the timestep alone.
+ENOUGH = 0.02  # the solver ends at a smaller gain: cost of a residual of 0.2 standard deviations
+FREE = 0.01  # a step with at most this regulariser is hardly damped: the Hessian's diagonal is ~1
+SOFT = 2.0  # residuals above this multiple of the noise count linearly
+# Lower limits of the noise. If a simulator wrote the log, only its timestep causes residuals.
 LEAST = {
     "wheel speed": 0.001,
     "wheel yaw rate": 0.003,
@@ -388,7 +388,7 @@ class FitSolution:
     z: F64  # (n,)
     residual: F64  # (R,) in units of noise
     jacobian: F64  # (R, n)
-    segment: NDArray[np.int64]  # (R,) of each residual
+    segment: NDArray[np.int64]  # (R,) index of each residual's segment
     scale: dict[str, float]  # channel -> noise, including its correlation along segments
     converged: bool
 
@@ -409,7 +409,7 @@ class FitProblem:
 
     @property
     def segment(self) -> NDArray[np.int64]:
-        """Return the segment (R,) of each residual."""
+        """Return the index (R,) of each residual's segment."""
         steps, num = self.residuals.segments.horizon_steps + 1, len(self.residuals.segments)
         widths = [2 * steps if name == "position" else steps for name in self.residuals.channels]
         return np.concatenate([np.repeat(np.arange(num), width) for width in widths])
@@ -421,10 +421,10 @@ class FitProblem:
         change. A jump is not a slope, so for these two, quotients are taken on both sides. The
         smaller one is used, or 0 if their signs differ.
         """
-        del residual  # it is at an interpolated latency, but this is at a whole step
+        del residual  # unused: its latency is interpolated, but quotients start at a whole step
         size, steps = len(self.coordinates), self.coordinates.steps
         at = self.coordinates.drivable(z.reshape(-1))
-        # For latency, the quotient is on the side of z, where residuals are interpolated.
+        # The rounded latency is stepped toward z: residuals at z are interpolated on that side.
         forward = (at + steps <= 1.0) & (z.reshape(-1) >= at - 1e-9)
         forward |= at - steps < 0.0
         step = np.where(forward, steps, -steps)
@@ -463,7 +463,7 @@ def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float,
 
     def watch(trace: list[minimize.IterLog]) -> None:
         steps[:] = trace
-        free = trace[-1].regularizer <= FREE  # a step that is held back always gains little
+        free = trace[-1].regularizer <= FREE  # a damped step gains little even far from the optimum
         if free and 0 < trace[-1].reduction < ENOUGH and len(trace) > 1:
             raise _GoodEnough
 
@@ -490,7 +490,7 @@ def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float,
 
 
 class _GoodEnough(Exception):
-    """Raised to stop the solver once a step gains less than a log can resolve."""
+    """Raised to stop the solver once a step reduces the cost by less than `ENOUGH`."""
 
 
 def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:

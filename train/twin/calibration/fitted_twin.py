@@ -54,7 +54,7 @@ class HeldOutGap:
     horizon_s: float
     segments: int
     before_m: float  # median over the segments, with the base
-    after_m: float  # the same with the fitted perturbation
+    after_m: float  # median over the segments, with the fitted perturbation
     low_m: float  # 95 % interval of `after_m`, from a bootstrap over segments
     high_m: float
 
@@ -68,10 +68,10 @@ class FittedTwin:
     estimates: tuple[ParameterEstimate, ...]
     warnings: tuple[str, ...]
     held_out: tuple[HeldOutGap, ...]
-    noise: dict[str, dict[str, Any]]  # channel -> unit, before, after: median deviations
-    segments: int  # that were fitted
-    clusters: int  # number of units of the bootstrap
-    left_out: dict[str, int] = field(default_factory=dict)  # reason -> segments or steps
+    noise: dict[str, dict[str, Any]]  # channel -> its unit, and median deviation before and after
+    segments: int  # number of fitted segments
+    clusters: int  # number of episodes, or segments, that the bootstrap draws from
+    left_out: dict[str, int] = field(default_factory=dict)  # reason -> how many left out
 
     def describe(self) -> dict[str, Any]:
         """Return the fit as plain values for JSON."""
@@ -160,7 +160,7 @@ FEW_CLUSTERS = 8
 PROFILE_POINTS = 12
 CHI_SQUARE_95 = 3.84  # with one degree of freedom
 SLIDES_MPS = 0.05  # a wheel slides if it is faster than this over the floor
-CONFOUNDED = 0.95  # correlation of two estimates from which to warn
+CONFOUNDED = 0.95  # warn if two estimates have at least this correlation
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
         hessian[index] = part.T @ (weight[rows, None] * part)
     useful = solution.coordinates.useful
     whole = hessian.sum(axis=0)
-    inside = (solution.z > 1e-9) & (solution.z < 1 - 1e-9)  # at an end the gradient need not be 0
+    inside = (solution.z > 1e-9) & (solution.z < 1 - 1e-9)  # at the ends, gradients may not be 0
     gradient = np.where(inside, gradient - gradient.mean(axis=0), gradient)
 
     # A tiny ridge: else a parameter without information would make all intervals infinite.
@@ -211,7 +211,7 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     spread = 1.4826 * np.median(np.abs(moved - np.median(moved, axis=0)), axis=0)
     inverse = np.linalg.inv(whole + ridge)
     deviation = np.sqrt(np.diag(inverse))
-    # The bootstrap has no spread if residuals do not depend on a parameter: use the larger of both.
+    # Use `deviation` if it is larger: without an effect on residuals, the bootstrap's spread is 0.
     half = student.ppf(0.975, max(count - 1, 1)) * np.maximum(spread, deviation)
     return Uncertainty(
         half=half,
@@ -245,7 +245,7 @@ def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tupl
 
 
 def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
-    """Return the z at which the cost passes chi-square, next to the outermost point that fits."""
+    """Interpolate the z, outside the last point that fits, at which `rise` reaches chi-square."""
     outer = inner + way
     if not 0 <= outer < len(grid):
         return float(grid[inner])
@@ -256,7 +256,7 @@ def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
 def unidentified(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty
 ) -> ParameterEstimate | None:
-    """Return the least identified parameter among those to keep at base; None if there is none.
+    """Return the least identified of the parameters to keep at their base values, or None.
 
     A poorly identified parameter is kept at base if the base value fits the log as well, or if the
     parameter has no effect at the end of its range.
@@ -281,8 +281,8 @@ def _keep_at_base(
     ends = [_value(solution, index, end) for end in (low, high)]
     start = coordinates.point(BASE)[index]
     base_fits = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
-    # At an end of its range, where residuals do not depend on it, the value is an accident of the
-    # search, even if the cost jumps on the way from there to the base.
+    # If the search ended at an end of the range, where residuals do not depend on the parameter,
+    # the value is arbitrary, even if the cost jumps between that end and the base value.
     lost = uncertainty.half[index] > 1 and not 1e-9 < solution.z[index] < 1 - 1e-9
     if not base_fits and not lost:
         return None

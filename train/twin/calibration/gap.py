@@ -78,8 +78,8 @@ from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
 
-PAST = 5  # control periods of commands before the step: longer than any latency and ramp
-AGREES = 0.05  # largest difference of clearance entries on one floor: noise and a few pallets
+PAST = 5  # commands before the step that are replayed: longer than any latency and ramp
+AGREES = 0.05  # largest `agreement` if the floor is the log's: from noise and a few pallets
 SAME_M = 1e-3  # tolerance of a plan's remaining length, which is stored as float32
 SPACING_M = 0.02  # points closer to each other give no direction
 ROUTE = (
@@ -99,9 +99,9 @@ class StepResult:
 
 @dataclass(frozen=True)
 class OneStep:
-    """n steps, as logged and as each twin drove them."""
+    """n separate steps, as logged and as each twin drove them from the logged states."""
 
-    rows: Ints  # (n,) indices in the logged steps
+    rows: Ints  # (n,) indices of the steps in the `LoggedSteps`
     now: F32  # (n, D) the logged observation at t
     logged: StepResult
     twins: dict[str, StepResult]
@@ -119,7 +119,7 @@ def one_step(
     warehouse: Warehouse | None,
     config: GapConfig,
 ) -> OneStep:
-    """Compare one step of the twins from each of `rows` (n,), whose next step must be known.
+    """Drive one step of each twin from each of `rows` (n,), whose next logged step must be known.
 
     `warehouse` is the floor of the log. If it is None, the floor is empty, and lidar readings are
     not compared.
@@ -140,7 +140,7 @@ def one_step(
 
     logged_terms = terms(after, steps.progress_m[rows])
     summed = np.asarray(sum(logged_terms.values()))
-    # Custom reward terms may need earlier steps, so that only the built-in terms are compared.
+    # Custom reward terms may need earlier steps, so only the built-in terms are compared.
     earned = summed if task.reward_terms else steps.reward[rows]
     logged = StepResult(next_observed, earned, logged_terms)
     adds_up = np.abs(summed - earned) < 1e-3
@@ -211,7 +211,7 @@ def agreement(steps: LoggedSteps, store: Store, rows: Ints, warehouse: Warehouse
     """Return how far the lidar at `rows` (n,) differs from what it would see on this floor, 0 to 1.
 
     It is the median over the rows of the mean difference of the observation's clearance entries,
-    which go from 0 (touching) to 1 (nothing within range). Up to `AGREES` the floor is the log's.
+    which go from 0 (touching) to 1 (nothing within range). Up to `AGREES` it is the log's floor.
     """
     task = steps.task
     observed, _ = observations(store, steps.transition_id[rows], task.observation_size)
@@ -263,7 +263,7 @@ class PlanMemory:
 
 
 def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
-    """Rebuild the plans of all rows; there are none if the task has no route."""
+    """Rebuild the plans of all rows; without a route in the task, return no plans."""
     count = len(steps)
     if steps.task.goal != "route":
         nowhere = np.full(count, -1, np.int64)
@@ -305,7 +305,7 @@ def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
     if len(line) == 1:
         ahead_of = np.array([np.cos(yaw[0]), np.sin(yaw[0])])
         return np.stack([line[0], line[0] + ahead_of * max(rest, SPACING_M)])
-    if rest > 0:  # its end was never seen: continue straight for the remaining length
+    if rest > 0:  # the plan's end was never seen: continue straight for its length
         way = line[-1] - line[-2]
         way = way / max(float(np.hypot(*way)), 1e-9)
         line = np.concatenate([line, (line[-1] + way * rest)[None]])
@@ -431,7 +431,7 @@ def _observation_rows(
     """Yield the mean absolute gap of each observation component that depends on the twin."""
     sources = {name: result.observation for name, result in stepped.twins.items()}
     sources |= {PERSISTENCE: stepped.now}
-    # These are copied from the log: the applied action, and the proposals of its navigation.
+    # The applied action and the navigation stack's proposals are copied from the log.
     left_out = ["previous_action_", "nav_"]
     left_out += [] if stepped.lidar else ["clearance_", "closing_"]
     left_out += [] if steps.task.goal == "route" else ["near_", "far_", "goal_"]
@@ -458,8 +458,8 @@ def _reward_rows(
     """Return the gaps by term, and the ratio of the reward's gap to its spread.
 
     The ratio is by condition and source. The spread is the mean distance of a step's reward from
-    the median, with the cost of a step as its minimum: rewards of a robot that stands are all
-    equal, so that any gap would be large compared with their spread.
+    the median, but at least the cost of a step: a standing robot's rewards are all equal, so any
+    gap would be large compared with their spread.
     """
     rows_by_term, ratios = [], {}
     least = abs(steps.task.rewards.step)

@@ -46,16 +46,16 @@ class LoggedSteps:
     recording_id: Strings  # (N,)
     episode_id: Strings  # (N,)
     step_index: Ints  # (N,) in its episode
-    begins: Bools  # (N,) the step before is not in the row before: new episode, or missing steps
-    condition: Strings  # (N,) the label
-    true_condition: Strings  # (N,) of a simulator; "" if unknown
+    begins: Bools  # (N,) the row before is not the step before: new episode, or missing steps
+    condition: Strings  # (N,) the labelled condition
+    true_condition: Strings  # (N,) logged by a simulator; "" if unknown
     conditions: dict[str, Bools]  # name -> (N,) whether it holds; `nominal` if no other does
     action: Ints  # (N,)
     reward: F64  # (N,)
     progress_m: F64  # (N,)
     ending: Ints  # (E,) indices of rows whose successor only ends the episode
     ends: Signals  # the signals of these successors, (E,) each
-    robot: RobotModel | None = None  # of the profile; None: the twin's stand-in
+    robot: RobotModel | None = None  # the profile's robot; None: the twin's stand-in
 
     def __len__(self) -> int:
         return len(self.transition_id)
@@ -222,7 +222,7 @@ def _conditions(held: Sequence[Sequence[str] | None]) -> dict[str, Bools]:
 def _ends(
     store: Store, recordings: Sequence[str], episode: Strings, step: Ints, last: Bools
 ) -> tuple[Ints, Signals]:
-    """Return the `last` rows (N,) of stretches that an episode's end follows, and its signals."""
+    """Return which rows of `last` (N,) precede an episode's end, and the signals at these ends."""
     row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
     rows, parts = [], []
     for recording, ends in store.episode_ends(recordings):

@@ -36,7 +36,7 @@ from restock.train.twin.physics.simulation import Simulation
 WARMUP_S = 1.0  # longer than any latency, and than stopping with friction .2
 STILL_MPS = 0.02  # a slower robot stands
 TOUCHING_M = 0.05  # a robot closer to something may be touching it
-EVEN = 0.25  # of a control period: tolerance of the times of ticks and poses
+EVEN = 0.25  # tolerance of ticks' times and poses' ages, as a share of the control period
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
 MOTION = (
     *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2"),
@@ -64,11 +64,11 @@ class LoggedSegments:
     horizon_steps: int  # K
     warmup_steps: int  # W
     row: Ints  # (S,) index of the first of the K steps in the `LoggedSteps`
-    transition_id: Ints  # (S,) of this step
+    transition_id: Ints  # (S,) ID of that first step
     recording_id: NDArray[np.str_]  # (S,)
     episode_id: NDArray[np.str_]  # (S,)
     condition: NDArray[np.str_]  # (S, K) the label of each step
-    true_condition: NDArray[np.str_]  # (S, K) of a simulator; "" if unknown
+    true_condition: NDArray[np.str_]  # (S, K) logged by a simulator; "" if unknown
     command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; 0 before an episode begins
     still: NDArray[np.bool_]  # (S,) some of the W steps are missing, but the robot stood there
     before: dict[str, F64]  # the signals of `BEFORE` when the W steps begin, (S,) each
@@ -104,11 +104,11 @@ def log_segments(
 ) -> LoggedSegments:
     """Cut logged episodes into segments of `horizon_s`.
 
-    The next segment begins `stride_s` later (None: the horizon, so that none overlap), or at the
-    first tick after that at which its first pose is fresh, and all its steps and those of the
-    warm-up (rounded up to whole steps) are there and evenly spaced. At an episode's start, the
-    warm-up is not needed if the robot stood still. A pose is fresh if its age is the recording's
-    median age, within a quarter of a control period.
+    Segments begin at least `stride_s` apart (None: the horizon, so that none overlap), at ticks
+    with a fresh pose. The steps of a segment must be evenly spaced, and those of the warm-up
+    (rounded up to whole steps) must precede it, except at an episode's start if the robot stood
+    still. A pose is fresh if its age is the recording's median age, within a quarter of a control
+    period.
 
     Raises:
         ConfigError: the horizon or stride is not a multiple of the control period.
@@ -191,7 +191,7 @@ def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str
     """Return the segments of ordinary driving, and counts of the others by reason."""
     touched = segments.signals["bumped"].astype(bool).any(axis=1)
     near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
-    # True conditions are preferred: a label also says slip if the whole floor is slippery.
+    # True conditions are preferred: if the whole floor is slippery, labels also report slip.
     known = segments.true_condition != ""
     truth = np.char.find(np.char.add(segments.true_condition, ","), "wheel_slip,") >= 0
     slips = np.where(known, truth, segments.condition == "wheel_slip")
@@ -268,8 +268,8 @@ def _periods(task: Task, seconds: float, name: str) -> int:
     return count
 
 
-ROBOTS = 512  # simulated at a time
-SLIP_MPS = 0.2  # if the wheels' speed differs by more from the localised one, the latter is used
+ROBOTS = 512  # number of robots that are simulated at a time
+SLIP_MPS = 0.2  # if wheel and localised speed differ by more, the robot starts at the localised one
 EMPTY_M = 60.0  # side of an empty floor; robots near its wall are moved back to the middle
 SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
 
@@ -279,8 +279,8 @@ class OpenLoopStart:
     """The initial states of S robots, and their commands from there.
 
     `motion` are the logged wheel speed and yaw rate, gyroscope, localised speed and lateral speed,
-    (S,) each. The base controllers begin in the state that the `past` commands lead to or, without
-    `past`, as if they had always been commanded the motion of their wheels.
+    (S,) each. The base controllers begin in the state to which the `past` commands lead. Without
+    `past`, they begin as if the motion of the wheels had always been commanded.
     """
 
     pose: F64  # (S, 3) x, y and heading
@@ -464,8 +464,8 @@ def replay_segments(
 ) -> OpenLoopResult:
     """Drive every segment's commands under every perturbation, on an empty floor.
 
-    The result has the K steps without the warm-up, with localised speeds, too. Poses are moved so
-    that each segment begins at its logged pose.
+    The result covers the K steps, not the warm-up, and includes localised speeds. Poses are moved
+    so that each segment begins at its logged pose.
 
     Raises:
         ConfigError: as `drive_open_loop`.

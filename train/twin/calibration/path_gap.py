@@ -44,7 +44,7 @@ class PathGap:
     episode_id: NDArray[np.str_]  # (S,)
     holds: dict[str, Bools]  # condition -> (S,) whether a segment counts for it
     gaps: dict[tuple[str, str], F64]  # (source, quantity) -> (S,); NaN if unknown
-    left_out: dict[str, int]  # reason -> steps
+    left_out: dict[str, int]  # reason -> number of steps at which no segment begins
 
 
 def path_gap(
@@ -55,8 +55,8 @@ def path_gap(
 ) -> PathGap:
     """Replay segments of `horizon_s` that overlap by half, and measure their gaps.
 
-    The gap of a pose is that at the segment's end; that of a signal is the root mean square over
-    the segment.
+    For poses, the gap is measured at the segment's end. For signals, it is the root mean square
+    over the segment.
 
     Raises:
         ConfigError: the horizon is not a multiple of the control period.

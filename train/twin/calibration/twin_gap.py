@@ -58,7 +58,7 @@ class TrustLimits:
     """Limits that a twin must keep to be trusted in a condition."""
 
     horizon_s: float = 3.0
-    position_m: float = 0.2  # nine in ten segments of that horizon end within it
+    position_m: float = 0.2  # limit for the 90th percentile of position gaps at `horizon_s`
     reward_ratio: float = 1.0  # one-step reward gap over the reward's spread
     segments: int = 20  # with fewer segments or episodes the verdict is "unknown"
     episodes: int = 5
@@ -68,8 +68,8 @@ class TrustLimits:
 class GapConfig:
     """Settings of a gap measurement. Raises ConfigError if they allow no verdict."""
 
-    horizons_s: tuple[float, ...] = (1.0, 3.0, 6.0)  # must include that of the limits
-    max_segments: int = 400  # per condition and horizon; 5 times as many steps
+    horizons_s: tuple[float, ...] = (1.0, 3.0, 6.0)  # must include `limits.horizon_s`
+    max_segments: int = 400  # per condition and horizon; one-step gaps use 5 times as many steps
     limits: TrustLimits = TrustLimits()
     seed: int = 0
     timestep_s: float = 0.01
@@ -206,7 +206,7 @@ def write_gap(gap: TwinGap, folder: Path | str) -> None:
 
 
 def gap_folder(places: Iterable[Path]) -> Path | None:
-    """Return the gap's folder of the first of these runs and stores that has one; else None."""
+    """Return the `gap` folder of the first run or store in `places` that has a gap; else None."""
     return next((place / FOLDER for place in places if (place / FOLDER / DOCUMENT).is_file()), None)
 
 
