@@ -67,7 +67,7 @@ class SoftPolicy:
         raise NotImplementedError
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return the robots (N,) for which it does not explore; none by default."""
+        """Return for which robots (N,) the policy never explores; none by default."""
         return np.zeros(env.num_envs, np.bool_)
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
@@ -114,7 +114,7 @@ class PlannerFollower(SoftPolicy):
         return self._follower(env).choose(env.signals)
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return the robots (N,) for which it does not explore: those near an obstacle."""
+        """Return for which robots (N,) the policy never explores: those near an obstacle."""
         return self._follower(env).near(env.signals)
 
     def _follower(self, env: WarehouseVectorEnv) -> PathFollower:
@@ -181,7 +181,7 @@ class Handover:
         trouble = (self._still >= STUCK_STEPS) | (self._slipping >= SLIP_STEPS)
         self._pass((trouble | signals["bumped"]) & ~self._by_operator, to_operator=True)
         clear = (
-            ~(signals["clearance_m"] <= 0.2)  # NaN: not known
+            ~(signals["clearance_m"] <= 0.2)  # true for NaN, too: clearance not known
             & (self._slipping == 0)
             & ~signals["bumped"]
             & (self._since_handover >= MIN_STEPS_BETWEEN_HANDOVERS)
@@ -198,8 +198,8 @@ class Handover:
 # Less room than TOUCH_M counts as a hit, and less than ROOMY_M costs. Both are for robots at least
 # WIDTH_M wide, and are scaled down for narrower ones.
 TOUCH_M, ROOMY_M, WIDTH_M = 0.05, 0.12, 0.5
-PERSON_MARGIN_M = 0.4  # to people who move
-STANDING_MARGIN_M = 0.2  # to people who stand
+PERSON_MARGIN_M = 0.4  # distance to keep from people who move
+STANDING_MARGIN_M = 0.2  # distance to keep from people who stand
 
 
 def simulate(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> tuple[F64, F64]:
@@ -237,11 +237,11 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     The first are exact below `ROOMY_M`; larger ones all count the same.
     """
     outline = outline_of(env, points=3)
-    beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # this far from a centre, all have room
+    beyond_m = float(np.hypot(*outline.T).max()) + ROOMY_M  # from here on, clearance is ample
     room = np.full(ends.shape[:3], ROOMY_M)
     on, pallets = env.layout[ids], env.simulation.pallets[ids]
     boxes = np.concatenate([pallets[..., :2], pallet_half_m(pallets[..., 2])], axis=-1)
-    boxes[pallets[..., 0] <= 0, :2] = np.inf  # not placed
+    boxes[pallets[..., 0] <= 0, :2] = np.inf  # pallets that are not on the floor
     for index in set(on.tolist()):
         rows = np.flatnonzero(on == index)
         floor, pose = env.floors[index], ends[rows]
@@ -292,18 +292,18 @@ def outline_of(env: WarehouseVectorEnv, points: int) -> F64:
 BACK_S = (2.4, 3.2)  # shortest and longest time of backing off
 _LOOK_M = tuple(0.3 * step for step in range(14))
 HORIZON_S = 1.2
-CAREFUL_M = 1.8  # from the robot's centre to a person's
+CAREFUL_M = 1.8  # a person is near if the robot's and the person's centres are this close
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
 STILL_S = 1.0  # a robot that has not moved for longer is stuck
-PATIENCE_S = 4.0  # the same with somebody near: then it moves about, so that they let it pass
-# Changes of position (m) and heading (rad) that count as movement, for robots that move by at least
-# MOVED_STEP in a control period; less for slower ones.
+PATIENCE_S = 4.0  # with a person near, a robot waits this long, then moves about to be let pass
+# Changes of position (m) and heading (rad) that count as movement. They are scaled down for robots
+# that cannot move by MOVED_STEP in a control period.
 MOVED = np.array([0.1, 0.2])
 MOVED_STEP = np.array([1.0, 1.2]) * 0.2
 WINDOW_M = 2.3  # how far a lattice reaches around the centres of pallets
-# Near pallets, a plan is one action for FIRST_S, then another. The previous step's plan is kept
-# unless another is better by BETTER_S: else replanning at every step can postpone a turn for ever.
+# Near pallets, a plan is one action for FIRST_S, then another until PAIR_S. The last step's plan is
+# kept unless another is better by BETTER_S: else replanning can postpone a turn for ever.
 PAIR_S, FIRST_S, NEXT_S, BETTER_S = 1.6, 0.6, 0.4, 0.1
 
 
@@ -345,7 +345,7 @@ class Operator(SoftPolicy, Stateful):
         self._still = np.zeros(count, np.int64)
         self._waiting = np.zeros(count, np.bool_)
         self._backing = np.zeros(count, np.int64)
-        self._stuck_m = np.full((count, 2), np.nan)  # where each was last stuck in its episode
+        self._stuck_m = np.full((count, 2), np.nan)  # where it was last stuck, per robot
         self._lattices: dict[int, tuple[int, StateLattice | None]] = {}  # robot -> episode, lattice
 
     def restored(self) -> None:
@@ -353,7 +353,7 @@ class Operator(SoftPolicy, Stateful):
         self._lattices = {}
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """Return the action that gets farthest along the way and keeps enough clearance."""
+        """Return the actions (N,) that get farthest along the way and keep enough clearance."""
         pose = env.simulation.pose()
         self._find_ways(env, pose)
         table = np.asarray(env.task.actions, np.float64)
@@ -364,7 +364,7 @@ class Operator(SoftPolicy, Stateful):
         held = np.broadcast_to(table[:, None], (count, actions, horizon, 2))
         ends, speed = simulate(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
         room, people = room_of(env, everyone, ends)  # (N, A, T)
-        people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # people stop before it
+        people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # people stop if robots stand
         arrived = self._arrived(env, everyone, ends)
         room[arrived] = people[arrived] = 9.0  # what comes after the goal does not matter
         flat = ends[:, :, -1].reshape(-1, 3)
@@ -384,7 +384,7 @@ class Operator(SoftPolicy, Stateful):
         score -= np.where(icy[:, None] & harsh_actions(table)[None, :], 3.0, 0.0)
         score += 1.0 * arrived.any(axis=2)
         alone = people.min(axis=(1, 2)) > 0.6
-        score[alone, 0] -= 0.2  # nobody to wait for
+        score[alone, 0] -= 0.2  # action 0 is to stop, but there is nobody to wait for
         # A robot that has stood for a while backs off, or tries another action that hits nothing.
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
@@ -426,7 +426,7 @@ class Operator(SoftPolicy, Stateful):
         score = score[:, :, begun:].max(axis=2)
         nearest = room[:, :, : begun + steps_of(env, NEXT_S)].min(axis=2)
         score -= np.clip(roomy_m - nearest, 0.0, roomy_m) / roomy_m * (room[:, :, 0] > 0)
-        score[plans[:, :, 0] == 0] -= 0.3  # nobody to wait for
+        score[plans[:, :, 0] == 0] -= 0.3  # action 0 is to stop, with nobody to wait for
         score[:, -1] += BETTER_S
         chosen = plans[np.arange(len(ids)), score.argmax(axis=1)]  # (n, T)
         self._plan[ids] = np.append(chosen[:, 1:], chosen[:, -1:], axis=1)
@@ -442,9 +442,9 @@ class Operator(SoftPolicy, Stateful):
         return np.flatnonzero(guided)
 
     def _lattice(self, env: WarehouseVectorEnv, index: int) -> StateLattice | None:
-        """Return the lattice of a robot's episode, around pallets and where it was stuck.
+        """Return the lattice of a robot's episode, around pallets and the place where it was stuck.
 
-        It is None if there is neither, and for robots that do not turn on the spot.
+        Return None without pallets and such a place, or if the robot cannot turn on the spot.
         """
         episode = int(self._episode[index])
         kept, lattice = self._lattices.get(index, (-1, None))
@@ -474,7 +474,7 @@ class Operator(SoftPolicy, Stateful):
         return lattice
 
     def _note_stuck(self, env: WarehouseVectorEnv, pose: F64, ids: Ints) -> None:
-        """Build new lattices for stuck robots (n,), unless their lattices reach there already."""
+        """Build new lattices for stuck robots (n,) that are outside their current lattices."""
         for index in ids.tolist():
             lattice = self._lattice(env, index)
             if lattice is None or not lattice.window.covers(*pose[index, :2]):
@@ -483,7 +483,7 @@ class Operator(SoftPolicy, Stateful):
                 self._ways[index] = self._way(env, index, pose[index])
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Return the robots (N,) for which it does not explore: those beside people."""
+        """Return for which robots (N,) the policy never explores: those beside people."""
         return _somebody_near(env, env.simulation.pose())
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
@@ -491,7 +491,7 @@ class Operator(SoftPolicy, Stateful):
         pose = env.simulation.pose()
         plans = env.navigation.plans_m
         view = view_route(plans, pose[:, 0], pose[:, 1], np.zeros(len(pose)), _LOOK_M)
-        ahead = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
+        ahead = view.look_ahead_m + pose[:, None, :2]  # in the map frame, since heading is 0
         gap = np.abs(ahead[:, :, None] - env.simulation.pallets[:, None, :, :2])
         half = pallet_half_m(env.simulation.pallets[:, None, :, 2])
         in_way = (gap < half + 0.35).all(axis=-1)
@@ -588,7 +588,7 @@ def _movement_limits(env: WarehouseVectorEnv) -> F64:
 
 
 def _motion(env: WarehouseVectorEnv) -> Motion | None:
-    """Return a robot's motion for a lattice; None if it does not turn on the spot."""
+    """Return a robot's motion for a lattice; None if the robot cannot turn on the spot."""
     table = np.asarray(env.task.actions, np.float64)
     turn = float(np.abs(table[table[:, 0] == 0.0, 1]).max(initial=0.0))
     ahead, back = float(table[:, 0].max()), float(-table[:, 0].min())

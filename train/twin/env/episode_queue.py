@@ -156,12 +156,12 @@ class MissionArm:
 
     name: str
     kind: str
-    share: float  # natural share: of the missions without practice
+    share: float  # share of all missions if practice is off
     block: str = ""  # partial | full; "": the seed draws it
-    order: int = -1  # index among the orders; -1: not of an order
+    order: int = -1  # index of its order; -1: the arm is not an order's
 
     def holds(self, kind: str, block: str) -> bool:
-        """Return whether episodes of this kind and block belong to the arm; False for an order."""
+        """Return whether this kind and block belong to the arm; False for the arm of an order."""
         return self.order < 0 and kind == self.kind and self.block in ("", block)
 
 
@@ -279,7 +279,7 @@ def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
 
 
 class EpisodeQueue(Stateful):
-    """A queue of episodes. An environment's n-th drawn episode does not depend on the others.
+    """A queue of episodes. An environment's n-th drawn episode is independent of all others.
 
     `conditions` are shares per kind of episode; a schedule draws a perturbation for each drawn
     episode. If missions are ordered (`follow`), a share of the drawn episodes comes from them.
@@ -307,9 +307,9 @@ class EpisodeQueue(Stateful):
         self.next_fixed = 0
         self._orders: MissionOrders | None = None
         self._orders_share = 0.0
-        self._offered: MissionArms | None = None  # the last that `arms` returned
-        self._arms: MissionArms | None = None  # that episodes are drawn from
-        self._arm_shares = np.zeros(0)  # cumulative
+        self._offered: MissionArms | None = None  # what `arms` returned last
+        self._arms: MissionArms | None = None  # arms to draw episodes from; None: no practice
+        self._arm_shares = np.zeros(0)  # cumulative shares of `_arms`
         self.set_conditions(conditions)
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
@@ -334,12 +334,12 @@ class EpisodeQueue(Stateful):
         self._orders, self._orders_share = orders, share
 
     def practise(self, shares: Sequence[float]) -> None:
-        """Draw episodes of the last `arms` from now on, in these shares."""
+        """Draw episodes from now on in these shares, one per arm that `arms` last returned."""
         parts = np.asarray(shares, np.float64)
         self._arms, self._arm_shares = self._offered, np.cumsum(parts) / parts.sum()
 
     def arms(self, planners: Sequence[Planner]) -> list[MissionArm]:
-        """Return the arms that its episodes can be drawn from."""
+        """Return the arms that episodes can be drawn from; `practise` sets their shares."""
         self._offered = MissionArms(
             self._layouts,
             planners,

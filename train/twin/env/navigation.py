@@ -169,13 +169,13 @@ LOOK_M = 1.9  # the block finder reads a scan only if something is this near ahe
 # follower is tuned for it, and is scaled for other robots.
 FASTEST_MPS, FASTEST_RADPS = 1.0, 1.2
 STAND_IN, PIVOT_M = Body(length_m=0.70, width_m=0.50), 0.14
-STANDING_SHARE = 0.2  # share of the stopping and slowing distances that the slowest robot keeps
+STANDING_SHARE = 0.2  # factor on stopping and slowing distances as the top speed nears 0
 
 
 class Navigation(Stateful):
     """Plans and goals of N robots, each on one of `floors`.
 
-    If `proposes` is true and the task has a route, the signals have the stack's next command.
+    If `proposes` is true and the task has a route, `propose` adds the next command to signals.
     """
 
     STATE = ("plans_m", "plan_number", "closures", "finder")
@@ -208,13 +208,13 @@ class Navigation(Stateful):
         self.finder.reset(np.array([env]))
 
     def add_route(self, signals: Signals, ids: Ints | slice = slice(None)) -> F64:
-        """Add the signals of the robots' plans and goals; return how far off plan they are."""
+        """Add the signals of plans and goals; return robots' distances (n,) from their plans."""
         return add_route(self.task, signals, self.plans_m[ids], self.goals_m[ids])
 
     def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> None:
         """Replan for robots that have strayed or found a block, and put new plans into the signals.
 
-        The step's progress is computed before this, so that a new plan never makes it jump.
+        Call this after computing the step's progress, so that a new plan does not change it.
         """
         replanned = set((offset_m > STRAYED_M).nonzero()[0].tolist())
         replanned |= self._find_blocks(signals, sensing)
@@ -326,7 +326,7 @@ class PathFollower:
         action[front < self.stop_m] = 0
         if self._steers:
             return self._turn_in_moves(signals, action, front, bend, side)
-        pivot = (bend > 0.9) & ~(signals["clearance_m"] <= self.pivot_m)  # NaN: not known
+        pivot = (bend > 0.9) & ~(signals["clearance_m"] <= self.pivot_m)  # allowed if NaN (unknown)
         return np.where(pivot, self._pivot[side], action)
 
     def _turn_in_moves(
@@ -339,7 +339,7 @@ class PathFollower:
         backs = signals["wheel_speed_mps"] < -0.05  # continue a move that has begun
         behind = self._nearest(signals, self._behind)
         turns = (bend > 0.9) | ((bend > 0.3) & (backs | (front < self.stop_m)))
-        room = np.where(backs, self.slow_m, self.stop_m)  # needed ahead to drive forward
+        room = np.where(backs, self.slow_m, self.stop_m)  # clearance needed ahead to drive on
         back = (front < room) & (behind > self.stop_m / 2)
         forward = np.where(front < self.stop_m / 2, 0, self._drive[1, side])
         return np.where(turns, np.where(back, self._back[side], forward), action)
@@ -401,10 +401,10 @@ class Truth(Stateful):
         self._period_s = task.control_period_s
         self._near_m = task.rewards.tight_clearance_m
         self._margin_m = MARGIN * task.body.width_m
-        self.aftermath_s = np.zeros(num_envs)  # time left of the recovery; 0: none
-        self.blocked = np.zeros(num_envs, np.bool_)  # at t
-        self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # to each, at t; inf if absent
-        self.exposed = np.zeros((num_envs, len(EXPOSURES)), np.bool_)  # at t
+        self.aftermath_s = np.zeros(num_envs)  # time left of a recovery; 0 if there is none
+        self.blocked = np.zeros(num_envs, np.bool_)  # at t, pallets were on the plan ahead
+        self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # per agent, at t; inf: none
+        self.exposed = np.zeros((num_envs, len(EXPOSURES)), np.bool_)  # exposures at t
 
     def reset(self, ids: Ints) -> None:
         self.aftermath_s[ids] = 0.0
@@ -455,14 +455,14 @@ class Truth(Stateful):
 def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
     """Return whether a pallet is within `margin_m` of the plan at each of VIEW_M, (n, VIEW_M)."""
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), VIEW_M)
-    points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
+    points = view.look_ahead_m + pose[:, None, :2]  # in the map frame, since heading is 0
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
     half = pallet_half_m(pallets[:, None, :, 2]) + margin_m
     return np.asarray((gap <= half).all(axis=-1).any(axis=-1), np.bool_)
 
 
 def info_now(env: WarehouseVectorEnv, signals: Signals | None = None) -> Info:
-    """Return the `info` of running episodes; `signals` None is a copy of the current signals."""
+    """Return the `info` of running episodes, with these signals (None: a copy of the current)."""
     return {
         "signals": signals or {name: column.copy() for name, column in env.signals.items()},
         "episode_condition": env.episode_condition.copy(),
@@ -496,6 +496,6 @@ def info_after(
         "success": ended & reached_goal(env.task, after) & (env.bumps == 0),
         "invalid": sim.diverged.copy(),
         "travelled_m": sim.travelled_m,
-        # inf, because Gymnasium's checker finds that NaN differs from NaN.
+        # inf replaces NaN: Gymnasium's checker compares infos, and NaN is unequal to itself.
         "closest_person_m": np.where(np.isnan(closest_m), np.inf, closest_m),
     }

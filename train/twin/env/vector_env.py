@@ -93,8 +93,8 @@ class DiscreteActions:
 class ContinuousActions:
     """An action space of speeds in m/s and yaw rates in rad/s, (N, 2), clipped to its range.
 
-    The range is the one that the table's actions span. `info["action"]` (N,) is the table's nearest
-    action, and `info["action_residual"]` (N,) its distance, as in the store's column of that name.
+    The task's actions span this range. `info["action"]` (N,) is the task's action nearest to the
+    command, and `info["action_residual"]` (N,) the distance between both, as in the store.
     """
 
     def __init__(self, task: Task, num_envs: int) -> None:
@@ -126,7 +126,7 @@ ACTIONS: Mapping[str, type[DiscreteActions | ContinuousActions]] = {
 def limit_actions(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
     """Limit the chosen actions; `info["limiter"]` is the rule that limited each.
 
-    A limited command gets the table's nearest action, as ingest would label its log.
+    The action of a limited command is the task's nearest, as ingest would label it.
     """
     action, command, reported = chosen
     before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
@@ -138,7 +138,7 @@ def limit_actions(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> C
     return action, command, {"action": action, "action_residual": residual, "limiter": limited.rule}
 
 
-OBSERVATION_LIMIT = 20.0  # bounds of the space, which clip observations; sensors give less
+OBSERVATION_LIMIT = 20.0  # observations are clipped to [-20, 20]; sensors stay within
 
 
 class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, PickledByArguments):
@@ -182,7 +182,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         one for each such episode (fixed episodes get its base), which is then in `env.specs`. It
         may also be the name of a built-in perturbation, a TOML file, or a table.
 
-        `robot` is a profile's, with the task's outline; None is the twin's own.
+        `robot` is the `[robot]` of a profile with the task's outline; None is the stand-in.
 
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
         `generated:train`. If an episode's spec names no floor, its seed draws one.
@@ -210,7 +210,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         self.layout_names = np.array([floor.name for floor in self.floors])
         self.floor_objects = np.empty(len(self.floors), object)
         self.floor_objects[:] = self.floors
-        self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
+        self.layout = np.zeros(num_envs, np.int64)  # floor index of the running episodes
         schedule = perturbation if isinstance(perturbation, Schedule) else None
         base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
         self.perturbation = base or Perturbation()
@@ -253,7 +253,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         self.signals: Signals = {}
         self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
         self.previous_action = np.zeros(num_envs, np.int64)
-        self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
+        self.steps = np.zeros(num_envs, np.int64)  # driven so far in the running episodes
         self.bumps = np.zeros(num_envs, np.int64)
         self.episodes_begun = np.zeros(num_envs, np.int64)  # rises with every episode
         self.episode_number = np.full(num_envs, -1)
@@ -261,8 +261,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         self.episode_seed = np.zeros(num_envs, np.int64)
         self.episode_condition = np.full(num_envs, "nominal", f"U{max(16, *map(len, KINDS))}")
         self.block = np.full(num_envs, "none", "U16")
-        self.perturbation_name = np.full(num_envs, "nominal", object)  # of any length
-        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON of values not nominal
+        self.perturbation_name = np.full(num_envs, "nominal", object)  # object: any length
+        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON of what is not nominal
 
     # -- floors ---------------------------------------------------------------------------------
 
@@ -357,7 +357,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         return self.observation.copy(), info_now(self)
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Step one control period; `actions` are indices (N,) of the task's, or commands (N, 2)."""
+        """Step one control period; `actions` are action indices (N,) or commands (N, 2)."""
         if not self.signals:
             raise gymnasium.error.ResetNeeded("call env.reset() before env.step()")
         now, sim, task = self.signals, self.simulation, self.task
@@ -494,7 +494,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any], PickledByArguments):
         return observation[0], _first(info)
 
     def step(self, action: Any) -> tuple[F32, float, bool, bool, dict[str, Any]]:
-        """Step one control period; `action` was chosen from `info["signals_before"]`."""
+        """Step one control period; `info["signals_before"]` are the signals before the step."""
         before = self.vector.signals
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
         info["signals_before"] = before
