@@ -87,7 +87,7 @@ WITH_THEIR_VERB = {
     *("coverage gaps", "coverage drift"),
     *("store compact", "store remove", "store verify"),
 }
-PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # go on if stdout is closed
+PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # verbs that finish even if stdout is closed
 FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
 
 
@@ -147,12 +147,12 @@ def _guarded(run: Callable[[list[str]], int], args: list[str]) -> int:
     try:
         with kill_as_interrupt():
             code = run(args)
-        sys.stdout.flush()  # here, so that BrokenPipeError is handled below
+        sys.stdout.flush()  # flush inside `try`, to catch BrokenPipeError
         return code
     except KeyboardInterrupt:
         return _interrupted()
     except BrokenPipeError:
-        # The reader of stdout has closed it (`| head`): no message, neither here nor at exit.
+        # The reader of stdout has closed it (`| head`). `drop` prevents Python's message at exit.
         drop(sys.stdout)
         return int(ExitCode.OK)
     except Exception as error:  # noqa: BLE001  (the one place that maps unforeseen errors)
@@ -307,7 +307,7 @@ def substitute_what_cannot_be_shown() -> None:
     """Replace characters that the encoding of stdout or stderr lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            with suppress(OSError):  # the file descriptor was replaced by a pipe
+            with suppress(OSError):  # tell() fails if a pipe has replaced the file
                 stream.reconfigure(errors=SUBSTITUTED)
 
 
@@ -378,7 +378,7 @@ class _Patient:
 
 
 def drop(stream: TextIO) -> None:
-    """Redirect a stream to the null device, with what it still buffers."""
+    """Redirect a stream to the null device, so that its buffer and later output are discarded."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

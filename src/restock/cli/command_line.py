@@ -26,11 +26,11 @@ _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
 def prepared(command: type[Any]) -> type[Any]:
-    """Return the dataclass with annotations that make tyro's help plain, and with help texts.
+    """Add help texts to a command's dataclass, and annotations that simplify tyro's help.
 
-    `X | None` becomes `Optional[X]`, because tyro would import typeguard and asyncio for the
-    former. The help shows an optional option as `STR`, not as `{None}|STR`, and no default that
-    has no meaning for the user.
+    `X | None` becomes `Optional[X]`, because tyro would import typeguard and asyncio to read the
+    first form. The help shows an optional option as `STR`, not as `{None}|STR`, and leaves out
+    the defaults None, (), True and False.
     """
     if command not in _PREPARED:
         _PREPARED.append(command)
@@ -62,12 +62,12 @@ def _prepared(hint: Any, default: Any) -> Any:
     """Return a field's type annotated for tyro: metavar, choices, whether to show its default."""
     kind, optional, how = declared(hint)
     choices: Any = Literal[how.choices] if how.choices else None
-    if optional and typing.get_origin(kind) is Literal:  # else tyro lists None among the choices
+    if optional and typing.get_origin(kind) is Literal:  # tyro would list None as a choice
         choices = kind
     shown = choices or optional or kind in _METAVARS
     silent = default in (None, ()) or isinstance(default, bool) or typing.get_origin(kind) is tuple
     marks: list[Any] = [
-        how,  # for `parse_plain`
+        how,  # `parse_plain` reads this from the annotation
         tyro.conf.arg(
             name=how.name,
             metavar=how.metavar or (_metavar(choices or kind) if shown else None),
@@ -94,7 +94,7 @@ def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
     help_asked = bool({"-h", "--help"} & set(words))
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False
-    if help_asked:  # printed here, because tyro does not wrap it
+    if help_asked:  # print the description here: tyro does not wrap it
         sys.stdout.write(_wrapped(command.__doc__ or "", min(columns, MAX_PROSE)) + "\n\n")
     return tyro.cli(
         command,
@@ -102,7 +102,7 @@ def parse(command: type[Any], prog: str, words: Sequence[str]) -> Any:
         description="",
         args=words,
         use_underscores=False,
-        config=(tyro.conf.FlagCreatePairsOff,),  # --json without --no-json
+        config=(tyro.conf.FlagCreatePairsOff,),  # offer --json, but not --no-json
     )
 
 

@@ -20,11 +20,11 @@ _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = (
     f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
 )
-# Folders of verbs that need the extra `train`, which includes `pages`.
+# Folders of verbs that need the extra `train`. It includes `pages`, which other verbs need.
 NEEDS_TRAIN = ("learning", "twin", "start")
 _GL = "MUJOCO_GL"
 _NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
-# Package that defines an exception -> remedy.
+# Package in which an exception is defined -> remedy for the message.
 _REMEDIES = {
     "duckdb": _OF_A_STORE,
     "_duckdb": _OF_A_STORE,
@@ -50,7 +50,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             "free some memory, or use a machine with more: DuckDB may take 80 % of it, or as much"
             " as RESTOCK_MEMORY_LIMIT in the environment says",
         )
-    if isinstance(error, StoreError) and error.where is None:  # raised by code that has only rows
+    if isinstance(error, StoreError) and error.where is None:  # the code that raised it has no path
         return StoreError(error.what, where=where, remedy=error.remedy)
     if isinstance(error, RestockError):
         return error
@@ -73,7 +73,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             names = (" ".join(args[:2]), *args[:1])
             learns = any(FOLDER_OF.get(name) in NEEDS_TRAIN for name in names)
             return not_installed(missing, where, "train" if learns else EXTRAS[missing])
-    if _in_gl(error):  # raised by importing MuJoCo, so by any verb that uses the twin
+    if _in_gl(error):  # importing MuJoCo fails if the library of MUJOCO_GL is missing
         what = f"MuJoCo cannot use {os.environ[_GL]!r}: {first_line(error)}"
         return known(what, _NO_GL, f"{_GL} in the environment")
     kind = type(error)

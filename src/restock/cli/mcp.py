@@ -74,7 +74,7 @@ class McpCommand:
 def _show_errors(
     tool: Callable[..., dict[str, Any]], error_type: type[Exception]
 ) -> Callable[..., dict[str, Any]]:
-    """Wrap a tool so that the client sees the text of its errors, which it would otherwise hide."""
+    """Raise a tool's errors as `error_type`, because MCP hides the text of any other type."""
 
     @wraps(tool)
     def run(*args: Any, **named: Any) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def _show_errors(
 
 @dataclass(frozen=True)
 class _Questions:
-    """The tools; the docstring of each is its description."""
+    """The tools. The client sees the docstring of a method as the tool's description."""
 
     place: str
     rows: int
@@ -189,7 +189,7 @@ class _Questions:
 
         def stop() -> None:
             wait = self.seconds
-            while not ended.wait(wait):  # repeat: an interrupt between two queries has no effect
+            while not ended.wait(wait):  # an interrupt between two queries is lost: repeat it
                 late.set()
                 connection.interrupt()
                 wait = 0.1

@@ -40,7 +40,7 @@ _STYLES = {
 
 @cache
 def _console_type() -> type[Console]:
-    """Return a Console of rich that leaves a closed pipe to `cli.main`; rich exits 1."""
+    """Return a Console that raises BrokenPipeError for `cli.main`; rich's own would exit 1."""
     from rich.console import Console  # slow to import
 
     class PipedConsole(Console):
@@ -88,7 +88,7 @@ def names_in(text: str) -> list[str]:
 def say_unverified(store: Store) -> None:
     """Say how many files a store has whose checksums nobody has verified; nothing if none."""
     if files := store.unverified():
-        sys.stderr.write(  # `sql` does not wait for rich
+        sys.stderr.write(  # not printed with rich, which `sql` would have to import
             f"note: {counted(files, 'file')} of {visible(str(store.path))} not verified:"
             f" `restock store verify {visible(quoted(store.path))}` compares their checksums\n"
         )
@@ -106,7 +106,7 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, Decimal):  # as text, scripts would compare it wrongly
+    if isinstance(value, Decimal):  # a number, because scripts would compare texts wrongly
         return int(value) if value == value.to_integral_value() else float(value)
     if isinstance(value, bytes):
         return value.hex()
@@ -199,7 +199,7 @@ def print_parted(
 
 
 def print_sections(sections: Iterable[Any], *, folded: bool = False) -> None:
-    """Print the tables of a page's sections, with `folded` also those that the page folds."""
+    """Print the tables of a page's sections; tables that the page folds only with `folded`."""
     for section in filter(None, sections):
         title: str | None = section.title
         for table in section.tables:
@@ -211,7 +211,7 @@ def print_sections(sections: Iterable[Any], *, folded: bool = False) -> None:
 def _grouped(
     rows: Sequence[Row], names: Sequence[str], key: Sequence[str], width: int
 ) -> list[list[str]]:
-    """Split columns into groups that fit into a width, each with the columns of `key`."""
+    """Split columns into groups that fit into a width; each group begins with the `key` columns."""
     least = {name: _least_width(rows, name) + GAP for name in names}
     groups: list[list[str]] = []
     for name in (name for name in names if name not in key):
@@ -222,7 +222,7 @@ def _grouped(
 
 
 def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
-    """Return the width a column needs so that no word, number or cell up to `short` is cut."""
+    """Return the width a column needs to show words, numbers and cells of `short` letters uncut."""
     from rich.cells import cell_len
 
     texts = [cell(row[name]).replace(r"\[", "[") for row in rows]
@@ -257,7 +257,7 @@ def _wrapped(text: str, columns: int) -> list[str]:
 
 
 def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
-    """Return the columns that are not empty in all rows."""
+    """Return the columns that have a value in at least one row."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]
 
@@ -268,7 +268,7 @@ def _styled(text: str) -> str:
 
 
 def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
-    """Return whether every row fits on a line of PIPE_WIDTH, so that rich need not be imported."""
+    """Return whether the rows need no rich to print: ASCII, one line each, within PIPE_WIDTH."""
     if not rows or any("\n" in name for name in names):
         return False
     total = 1 - 3
@@ -317,9 +317,9 @@ def print_elided(rows: Sequence[Row], columns: Sequence[str]) -> int:
     widths = [min(max(map(cell_len, column)), MAX_CELL) for column in zip(*lines, strict=True)]
     room, first, last = table_width(), len(columns), len(columns)
     if sum(widths) + GAP * (len(widths) - 1) > room:
-        room, first = room - 1, 0  # "…" stands for the hidden columns
+        room, first = room - 1, 0  # one character for "…" in place of the hidden columns
         while first < last:
-            at_left = first <= len(columns) - last  # from both ends in turn
+            at_left = first <= len(columns) - last  # add columns from left and right in turn
             room -= widths[first if at_left else last - 1] + GAP
             if room < 0:
                 break
@@ -434,7 +434,7 @@ def progress(description: str, total: float | None) -> Iterator[Advance]:
         TextColumn("{task.fields[note]}"),
         console=stderr(),
         transient=True,
-        redirect_stdout=sys.stdout.isatty(),  # data that go to a file are not touched
+        redirect_stdout=sys.stdout.isatty(),  # leave stdout alone if it is a file or a pipe
     )
     with bar:
         yield Advance(bar, bar.add_task(cell(visible(description)), total=total, note=""))

@@ -97,7 +97,7 @@ def _several(kind: Any) -> bool:
 
 
 def _value(kind: Any, how: Option, texts: Sequence[str]) -> Any:
-    """Convert words to the value of a field; raise ValueError if they are invalid, or `None`."""
+    """Convert words to the value of a field; raise ValueError for an invalid word or "None"."""
     if _several(kind):
         return typing.get_origin(kind)(_value(typing.get_args(kind)[0], how, [t]) for t in texts)
     choices = typing.get_args(kind) if typing.get_origin(kind) is Literal else how.choices

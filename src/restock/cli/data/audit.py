@@ -136,8 +136,8 @@ class AuditCommand:
         """Refuse options without effect and outputs that cannot be written, before any audit.
 
         Raises:
-            ConfigError: there is such an option.
-            StoreError: a place beside the store is not a panel or a run.
+            ConfigError: an option has no effect, or an output file cannot be written.
+            StoreError: a second or third PLACE is not a panel or a run, or both are of one kind.
         """
         if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
             raise ConfigError(
@@ -239,7 +239,7 @@ def _document(part: str, finding: Finding) -> dict[str, Any]:
 
 
 def _print(findings: list[Finding]) -> None:
-    """Print each finding with its first rows and advice, then the names of the others."""
+    """Print findings with their rows and advice, then the names of passed and skipped audits."""
     reported = [finding for finding in findings if finding.rows]
     if reported:
         output.print_table(
@@ -366,7 +366,7 @@ def difference_findings(document: dict[str, Any], *, old: str) -> list[Finding]:
 
 
 def gate_findings(document: Mapping[str, Any]) -> list[Finding]:
-    """Return a finding for each test of a run's gate: it fails unless shown not to be worse."""
+    """Return a finding per test of a run's gate. It fails unless "not worse" has been shown."""
     from restock.train.judge.sequential import NOT_WORSE
 
     found = []
@@ -385,7 +385,7 @@ def gate_findings(document: Mapping[str, Any]) -> list[Finding]:
 
 
 def failed_comparison(name: str, error: RestockError, *, option: str) -> list[Finding]:
-    """Return a failed finding for a comparison that was not possible, so that a pipeline notices.
+    """Return a failed finding for an impossible comparison, because pipelines must not pass it.
 
     `option` is the option that requested the comparison, with its value.
     """
@@ -416,8 +416,8 @@ class RewardAudit:
 
     discount: float
     returns: list[dict[str, Any]]  # one row per condition, driver and outcome
-    # One row per condition and pair of drivers; with fewer than three episodes, the ends of
-    # `more_return` are NaN.
+    # One row per condition and pair of drivers. `more_return` is the interval of the difference of
+    # their returns; its ends are NaN if a driver has fewer than three episodes.
     order: list[dict[str, Any]]
     findings: list[Finding]
 
@@ -438,14 +438,14 @@ def audit_reward(
 
     Args:
         place: a store, or a run.
-        audits, thresholds: all known ones; only those about the reward are run.
-        discount: per step; None: the run's own, or DISCOUNT for a store.
+        audits, thresholds: all audits and their thresholds; only the reward audits are run.
+        discount: factor per step; None: the discount of the run, or DISCOUNT for a store.
 
     Raises:
-        ConfigError: the discount is not that of the run's evaluations, or a threshold is for no
+        ConfigError: the run was evaluated with another discount, or a threshold names an unknown
             audit.
         RunError: the run was not evaluated, or an early version of Restock evaluated it.
-        StoreError: there is neither a store nor a run.
+        StoreError: `place` is neither a store nor a run.
     """
     folder = Location.of(place).folder
     of_run = folder is not None and (folder / RUN_CONFIG).is_file()

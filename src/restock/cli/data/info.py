@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
     from restock.ingest.containers.storage import Watch
 
-MAX_NAMED = 10  # at most so many attachments, metadata records, or entries of a record are listed
+MAX_NAMED = 10  # listed attachments, metadata records, and entries per record
 MAX_VALUE = 60  # characters of an entry's value that are shown
 NANOSECONDS = 1_000_000_000
-# Names of rmw's numbers: early versions of rosbag2 wrote numbers.
+# QoS setting -> names in the order of rmw's enum: early versions of rosbag2 wrote its numbers.
 _QOS = {
     "reliability": ("system_default", "reliable", "best_effort"),
     "durability": ("system_default", "transient_local", "volatile"),
     "history": ("system_default", "keep_last", "keep_all"),
 }
-MAX_PROFILES = 20  # QoS profiles that are read of a topic
+MAX_PROFILES = 20  # per topic; further QoS profiles are ignored
 
 
 @dataclass
@@ -141,11 +141,12 @@ def describe_recording(
     """Return format, size, time span and topics of a recording; only `clocks` decodes messages.
 
     Times are log times. `rate_hz` is a topic's number of messages divided by the recording's
-    duration. With `clocks`, the whole recording is read for its header stamps, every topic has a
-    `clock`, and `integrity` is known. `watch` is called with the progress.
+    duration. With `clocks`, all messages are read to compare header stamps with log times; the
+    result has a `clock` per topic, and `integrity`: whether checksums confirm what was read.
+    `watch` is called with the progress.
 
     Raises:
-        RecordingError: it cannot be opened; see `open_recording`.
+        RecordingError: the recording cannot be opened; see `open_recording`.
     """
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.containers.storage import LATEST_NS
@@ -243,7 +244,7 @@ def _date(stamp_ns: int) -> str:
 
 
 def _is_store(path: str) -> bool:
-    # Looks only for Delta logs: the store's own check would import DuckDB for every recording.
+    # Look only for Delta logs: `is_store` would import DuckDB even if all paths are recordings.
     logs = [Path(path, table, "_delta_log") for table in ("transitions", "recordings")]
     return "://" in path or all(log.is_dir() for log in logs)
 
@@ -265,7 +266,7 @@ def _names(names: list[str]) -> str:
 
 
 def _qos(profile: dict[str, Any]) -> str:
-    """Describe a QoS profile, as in `reliable, volatile, 10` (messages kept) or `keep_all`."""
+    """Format a QoS profile, as in `reliable, volatile, 10` (keeps 10 messages) or `keep_all`."""
     kept = profile.get("history")
     if kept == "keep_last" and "depth" in profile:
         kept = str(profile["depth"])
@@ -365,7 +366,7 @@ def _packages() -> list[Finding]:
         if requirement.marker and not requirement.marker.evaluate(
             {"extra": extra[1] if extra else ""}
         ):
-            continue  # for other machines
+            continue  # this requirement is for another platform
         name, wanted = requirement.name, requirement.specifier
         part = f"extra {extra[1]}" if extra else "needed"
         try:
@@ -393,7 +394,7 @@ def _torch() -> Finding:
 
 
 def _native() -> Finding:
-    """Check whether the update of a plain network is compiled; it is slower without."""
+    """Check whether the compiled training update is available; without it, training is slower."""
     state = native.state()
     if native.IS_THERE:
         return Finding("works", "native code", "ok", state)

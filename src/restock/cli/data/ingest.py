@@ -92,7 +92,7 @@ class IngestCommand:
         if self.workers < 1:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         tags = parse_tags(self.tag, empty=True)
-        profile = load_profile(self.profile)  # before the slow imports: it may not exist
+        profile = load_profile(self.profile)  # before slow imports: fails if it does not exist
 
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.decoding.definitions import choose_definitions
@@ -100,7 +100,7 @@ class IngestCommand:
 
         store = None if self.dry_run else self.store
         if store is not None:
-            StoreWriter(store).expect_folder()  # fail once and now, not for each recording
+            StoreWriter(store).expect_folder()  # fail once here, not for each recording
             StoreWriter(store).reach()
         chosen = choose_definitions(self.definitions)
         job = IngestJob(*(profile, store, self.force, self.salvage, chosen, self.repeated, tags))
@@ -116,7 +116,7 @@ class IngestCommand:
                 advance(1, path.name)
                 if isinstance(result, RestockError):
                     reported = str(result)
-                    if isinstance(result, StoreError):  # its message names only the store
+                    if isinstance(result, StoreError):  # the message names only the store
                         reported = f"{visible(str(path))}: was not added: {reported}"
                     failures.append({"path": str(path), "status": "failed", "error": reported})
                     line = summary.refuse(path, result) if summary is not None else reported
@@ -151,7 +151,7 @@ class IngestCommand:
         Watch(self.paths, job, hook, self.workers, self.json).run()
 
     def _recordings(self) -> tuple[list[Path], list[dict[str, Any]]]:
-        """Return the recordings of all paths, each once, and the paths that have none."""
+        """Return the recordings at all paths, each once, and a failure row per path without any."""
         from restock.ingest.containers.open_recording import recordings_in
 
         paths: dict[Path, None] = {}
@@ -165,7 +165,7 @@ class IngestCommand:
         return list(paths), failures
 
 
-# Entries of a manifest that are not printed: definitions, and values that have other keys.
+# Entries of a manifest that are not printed: definitions, and values printed under other keys.
 _LEFT_OUT = (
     *("task_json", "conditions_json", "profile_toml", "source_file", "label_scores"),
     "label_counts",
@@ -180,7 +180,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
     """Return an outcome as `--json` prints it."""
     from restock.ingest.store.manifest import GOOD
 
-    # With counts of events, which a recording that an early version ingested does not have.
+    # Counts of events by condition; manifests written by early versions lack them.
     counts = {row["condition"]: row for row in outcome.manifest.get("label_counts") or []}
 
     row = {key: value for key, value in outcome.manifest.items() if key not in _LEFT_OUT}
@@ -292,7 +292,7 @@ def show(outcome: IngestResult) -> None:
         for name, count in outcome.conditions.items()
     ]
     output.print_table(labels, output.reported(labels))
-    if outcome.exposures:  # these hold whatever the outcome is
+    if outcome.exposures:  # exposures are in a table of their own
         labels = [
             {"exposure": name, "transitions": count, **score_cells(name)}
             for name, count in outcome.exposures.items()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Attributes of a proposal that are printed.
 _PRINTED = ("missing", "signals", "ticks", "transitions", "problems", "commands", "kinds")
-OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
+OFTEN = 0.5  # a label on more than this share of the transitions is reported
 
 
 @dataclass
@@ -109,7 +109,7 @@ class ProfileCommand:
             self.hindsight_goals,
         )
         stem = (self.out or Path(self.paths[0])).stem
-        if self.out is None and self.robot is not None:  # so that robots' profiles differ in name
+        if self.out is None and self.robot is not None:  # a different name for each robot
             stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)
@@ -122,7 +122,7 @@ class ProfileCommand:
                 name = re.sub(r"\W+", "_", stem).strip("_") or "robot"
                 proposal = propose_for_drives(recordings, drives, name, given)
             losses = _losses(recordings, proposal.toml)
-        chosen.sort(key=lambda path: path != proposal.base)  # the base comes first
+        chosen.sort(key=lambda path: path != proposal.base)  # list the base recording first
         toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
         if self.out is not None:
             write_text(self.out, toml)
@@ -195,7 +195,7 @@ class ProfileCommand:
             recording = open_recording(
                 path, definitions=self.definitions, salvage=self.salvage, watch=advance.part
             )
-        recording.watch = no_progress  # the progress bar has ended
+        recording.watch = no_progress  # later reads have no progress bar
         if self.robot is not None:
             try:
                 choose_robot(recording, self.robot)

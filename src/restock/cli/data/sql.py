@@ -16,8 +16,8 @@ from restock.process import went_on_after_interrupt
 if TYPE_CHECKING:
     import duckdb
 
-SHOWN_ROWS = 40  # on a terminal; a file or a pipe gets all
-CUT_TO = 4  # values shown of a list that has more than twice as many, in a record on a terminal
+SHOWN_ROWS = 40  # rows shown on a terminal; files and pipes get all rows
+CUT_TO = 4  # a record on a terminal shows this many values of a list of more than twice as many
 RECORDS = r"\G"  # ends a query instead of a semicolon, as in MySQL
 HELP = r"""End a query with ";", or with "\G" to see each row as a record.
   .tables          the tables and views
@@ -190,9 +190,9 @@ class SqlCommand:
                 sys.stderr.write(f"{error}\n")
 
     def _places(self) -> tuple[str, tuple[str, ...], str | None]:
-        """Return the place to query, the places beside it, and the query.
+        """Return the first place, the panel and run to query with it, and the query.
 
-        The last word is the query if it is not a place.
+        The last word is the query if it is not the path of a panel or a run.
         """
         from restock.replay.places import kind_beside
 

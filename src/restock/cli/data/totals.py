@@ -20,7 +20,7 @@ STATUSES = ("written", "tagged", "dry run", "unchanged", "refused")
 
 
 class IngestSummary:
-    """The recordings of one `restock ingest`: counts them, and formats their lines and total."""
+    """Counts the recordings of one `restock ingest`; formats a line for each, and the total."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         folders = [str(path.parent.absolute()) for path in paths]
@@ -28,7 +28,7 @@ class IngestSummary:
         self.statuses = Counter[str]()
         self.labels = Counter[str]()
         self.reasons = Counter[str]()
-        self.found = Counter[str]()  # problem -> recordings that have it
+        self.found = Counter[str]()  # problem -> number of recordings with it
         self.transitions = self.skipped = self.dropped = 0
         self.duration_s = 0.0
 
@@ -37,7 +37,7 @@ class IngestSummary:
         return visible(os.path.relpath(path, self.folder)) if self.folder else visible(str(path))
 
     def add(self, outcome: IngestResult) -> str:
-        """Count a recording; return its line."""
+        """Count an ingested recording; return the line to print about it."""
         from restock.ingest.store.manifest import UNUSED
 
         row = outcome.manifest
@@ -67,7 +67,7 @@ class IngestSummary:
         return f"{outcome.status:<9} {self.name(outcome.path)}: {', '.join(parts)}"
 
     def refuse(self, path: Path | str, error: RestockError) -> str:
-        """Count a recording that was refused; return its line."""
+        """Count a recording that was refused; return the line to print about it."""
         what = first_line(error.what)
         self.statuses["refused"] += 1
         self.reasons[re.sub(r"\b\d[\d,.]*", "N", what.partition(":")[0])] += 1
@@ -92,7 +92,7 @@ class IngestSummary:
 
 
 def labels_of(conditions: Mapping[str, int]) -> dict[str, int]:
-    """Return the rows of each label that holds in any row, without `nominal`."""
+    """Return the numbers of rows of the labels, without `nominal` and labels without rows."""
     return {name: rows for name, rows in conditions.items() if rows and name != "nominal"}
 
 

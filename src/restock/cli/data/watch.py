@@ -45,9 +45,9 @@ from restock.replay.store.store import is_store
 POLL_S = 2.0
 STILL_S = 10.0
 RETRY_S = 60.0  # after a failure that the recording did not cause: full disk, unreachable store
-SALVAGE_AFTER_S = 600.0  # with --salvage, a recording that stays incomplete is then ingested
+SALVAGE_AFTER_S = 600.0  # wait before --salvage ingests an incomplete recording
 
-Stamp = tuple[tuple[str, int, int], ...]  # name, bytes and time of each file
+Stamp = tuple[tuple[str, int, int], ...]  # name, bytes and modification time of each file
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Watch:
         for folder in self.folders:
             if not Path(folder).is_dir():
                 raise ConfigError("not a folder, so nothing can arrive in it", where=folder)
-        if self.job.repeated == "keep":  # if a part was ingested too early, the whole replaces it
+        if self.job.repeated == "keep":  # replace recordings that were ingested incomplete
             self.job = replace(self.job, repeated="replace")
         self.arrivals = Arrivals(self.folders, self.job.salvage)
         self.summary = IngestSummary([Path(folder) / "recording" for folder in self.folders])
@@ -78,7 +78,7 @@ class Watch:
     def run(self) -> NoReturn:
         """Ingest complete recordings and follow up, again and again."""
         self.say("watch", ", ".join(self.folders))
-        written: list[dict[str, Any]] = []  # not yet followed up
+        written: list[dict[str, Any]] = []  # rows for the next `follow_up`
         due_s = time.monotonic() if is_store(str(self.job.store)) else math.inf
         while True:
             _raise_interrupt()
@@ -126,7 +126,7 @@ class Watch:
                 yield path, StoreError(first_line(error))
 
     def follow_up(self, written: list[dict[str, Any]]) -> bool:
-        """Print coverage and audits, and run the hook; return whether that could be done."""
+        """Print coverage and audits, and run the hook; return False if coverage or audits fail."""
         store, about = str(self.job.store), {"store": str(self.job.store), "recordings": written}
         try:
             StoreWriter(store).clean()
@@ -181,13 +181,13 @@ class _Arrival:
     stamp: Stamp
     since_s: float
     done: bool = False
-    reported: str = ""  # the last reason reported for waiting or failing
+    reported: str = ""  # the reason last reported for waiting or failing
     not_before_s: float = 0.0
 
 
 @dataclass
 class Arrivals:
-    """The recordings below some folders. `news` has the last look's events: (event, path, why)."""
+    """The recordings in some folders. `news` has the events of the last scan: event, path, why."""
 
     folders: Sequence[str]
     salvage: bool = False
@@ -196,10 +196,10 @@ class Arrivals:
     _absent: set[str] = field(default_factory=set)
 
     def complete(self, now_s: float) -> list[Path]:
-        """Look at the folders; return the complete recordings that are not ingested yet."""
+        """Scan the folders; return the complete recordings that are not ingested yet."""
         self.news = []
         there = {path: stamp for path in self._found() if (stamp := stamp_of(path))}
-        if not self._absent:  # a folder may come back with the recordings it had
+        if not self._absent:  # keep all while a folder is missing: it may come back
             self._known = {path: arrival for path, arrival in self._known.items() if path in there}
         ready = []
         for path, stamp in there.items():
@@ -215,7 +215,7 @@ class Arrivals:
         return ready
 
     def take(self, path: Path, error: RestockError | None, now_s: float) -> bool:
-        """Record how an ingest ended; return whether this has not been reported before.
+        """Record how an ingest ended; return False if the same error was reported before.
 
         A recording that was refused is tried again if its files change; any other failure is tried
         again later.
@@ -244,7 +244,7 @@ class Arrivals:
                 self.news.append(("back", folder, ""))
             try:
                 yield from recordings_in(folder)
-            except RecordingError:  # none yet, or the folder has just gone: reported next time
+            except RecordingError:  # the folder is empty, or has just disappeared
                 continue
 
     def _report_wait(self, path: Path, why: str) -> None:
@@ -255,7 +255,7 @@ class Arrivals:
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return name, size and time of each file of a recording; empty if it is gone."""
+    """Return name, size and time of each file of a recording; empty if the recording is gone."""
     try:
         beside = path.with_name(f"{path.name}-wal")  # SQLite's write-ahead log
         files = sorted(path.rglob("*")) if path.is_dir() else [path, beside]
@@ -271,7 +271,7 @@ def incomplete(path: Path) -> str:
         if not path.is_dir():
             return _unfinished(path)
         if container := folder_container(path):
-            with suppress(RecordingError):  # which ingest reports
+            with suppress(RecordingError):  # ingest reports this error
                 damage = container.open(path, salvage=True, watch=no_progress).damage
                 return damage[0].what if damage else ""
             return ""

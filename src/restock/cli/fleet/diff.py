@@ -168,7 +168,7 @@ def _untitled(*names: str) -> dict[str, str]:
 
 
 def _select_columns(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:
-    """Select columns and rename them to their titles; a column with two sides becomes two."""
+    """Select and rename columns; a column with values for both sides becomes two, a and b."""
     return [
         {title: value for name, of in columns.items() for title, value in _cells(row, name, of)}
         for row in rows

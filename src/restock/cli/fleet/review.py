@@ -134,7 +134,7 @@ class ReviewCommand:
             written = review.write()
         finally:
             review.close()
-        if self.json:  # stdout already has its document
+        if self.json:  # stdout may have only the JSON document, printed above
             output.say(f"{written.taken} verdicts are written, {len(written.held_back)} held back")
         else:
             print_written(written, "no verdict is new")

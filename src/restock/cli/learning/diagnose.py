@@ -82,7 +82,7 @@ class DiagnoseCommand:
             if found is None and self.twin:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = None
-        # Confirm the verdict of the run's own figures: a further run cannot show that rows are bad.
+        # `own` is the verdict without the checks of rows, which a further run cannot confirm.
         if self.confirm is not None:
             confirmation = confirm(
                 runs[0],
@@ -124,7 +124,7 @@ class DiagnoseCommand:
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
-    several = len(paths) > 1  # the verdict of a single run is printed below
+    several = len(paths) > 1  # a single run's verdict is printed below, not in the table
     print_parted(
         [
             {

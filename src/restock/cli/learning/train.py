@@ -157,8 +157,8 @@ def _train(prepared: Prepared) -> TrainResult:
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Make the first Ctrl-C stop the loop with a checkpoint, and the second one at once."""
-    # Printed on a thread, because the handler may interrupt code that is printing.
+    """Make the first Ctrl-C stop training with a checkpoint, and the second stop it at once."""
+    # Print on a thread, because the signal handler may interrupt code that is printing.
     reported = Thread(target=say, args=(_STOPPING,))
     stopping = False
 
@@ -220,7 +220,7 @@ def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
         if result is not None:
             mean = result.success_mean if result.success else "no goal"
             rows.append({"policy": name, **result.success, "mean": mean})
-    if rows:  # empty if nothing drove
+    if rows:  # empty if no evaluation episode was driven
         print_table(rows, title="success on the fixed episodes, greedy")
     if fed:
         print_table(fed_table(fed), title="what the critic was fed: % of all rows")

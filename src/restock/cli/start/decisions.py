@@ -17,12 +17,12 @@ from restock.files import read_json
 if TYPE_CHECKING:
     from restock.ingest.task.task import Task
 
-STEPS_A_SECOND = 500  # in the twin on a free core; for planning draws
-WARM_UP_PART = 0.5  # share of the allowed draws for offline updates, if rows are few
-UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other stages
-INTERVALS = 20  # least number of points in a curve
-DRIVERS = "behaviour_policies"  # key in a row of the coverage
-INSIDE = 0.5  # share of ticks with returns inside the outline above which the outline is wrong
+STEPS_A_SECOND = 500  # steps of the twin on a free core, to plan the draws of a run
+WARM_UP_PART = 0.5  # if rows are few: share of the allowed draws for offline updates
+UPDATES_A_MINUTE = 400  # on logs alone; 2,000 take five minutes with all other stages
+INTERVALS = 20  # a run without a twin records metrics at least this often
+DRIVERS = "behaviour_policies"  # key of a coverage row: who drove
+INSIDE = 0.5  # an outline with lidar returns inside it at more than this share of ticks is wrong
 
 
 class Stop(Exception):
@@ -87,7 +87,7 @@ def stop_for_outline(checked: Document, profile: Path | str | None) -> Stop | No
 
 
 def horizon(profile: Path | str | None) -> float:
-    """Return about 3 s as whole control periods: the horizon of the twin's limits."""
+    """Return the horizon for the twin's gap, in s: about 3 s, in whole control periods."""
     if (task := _task(profile)) is None:
         return 3.0
     period_s = task.control_period_s
@@ -129,7 +129,7 @@ def explain_mistrust(floor: StageResult, gap: StageResult) -> str | None:
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
-    """Return settings to train on the floor, on these kinds of episode; on all if empty."""
+    """Return settings to train on the floor with these kinds of missions; if empty, with all."""
     from restock.toml import toml_value
     from restock.train.twin.missions import DEFAULT_CONDITIONS
 
@@ -141,7 +141,7 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
 
 
 def split_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
-    """Split the kinds of mission that the floor has room for: kinds to drive, kinds to leave out.
+    """Return the kinds of missions that fit on the floor: those to drive, and those to leave out.
 
     Without a lidar, some kinds are left out: the robot would find a block only by driving into it.
     """
@@ -155,7 +155,7 @@ def split_kinds(to: Settings, floor: Document) -> tuple[list[str], list[str]]:
 
 
 def logs_alone_settings(coverage: Document) -> list[str]:
-    """Return settings for training without a twin, on actions that the logs' drivers might take."""
+    """Return settings to train without a twin, on actions that the logs' drivers may take."""
     from restock.toml import toml_value
 
     drivers = sorted({name for row in coverage.get("rows", []) for name in row[DRIVERS] or ()})
@@ -168,8 +168,8 @@ def updates_settings(
     """Return settings for as many offline updates as the panel's rows and the budget allow.
 
     `max_replays_per_row` limits the draws of a row. If rows are few, half of the draws are kept for
-    the twin, and `env_steps` is planned as the steps that fit into `seconds`. Without a twin,
-    metrics are recorded often enough for `INTERVALS` points in each curve.
+    training in the twin, and `env_steps` is the number of steps that fit into `seconds`. Without
+    a twin, metrics are recorded often enough for `INTERVALS` points in each curve.
     """
     from restock.train.dqn.config import TrainConfig
 

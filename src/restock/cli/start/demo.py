@@ -89,7 +89,7 @@ class DemoCommand:
 
 
 def find_logs() -> Path | None:
-    """Return `sample_logs/` of the source tree that this code runs from, if it runs from one."""
+    """Return `sample_logs/` of this source tree; None if it has no logs, or is an installation."""
     here = Path(__file__).resolve()
     logs = here.parents[4] / "sample_logs"
     if not logs.is_dir() or not any(logs.iterdir()):
@@ -134,7 +134,7 @@ def plan_of(to: Settings) -> list[Stage]:
             title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
             beside=tuple(to.training(uniform_panel, uniform)),
             writes=(to.run, uniform),
-            resume=(),  # one of the two trainings may have ended
+            resume=(),  # not resumed: one of the two trainings may have ended
         ),
         Stage(
             "even-out",
@@ -184,15 +184,15 @@ WHY = {
 
 
 def catch_up(to: Settings) -> list[str] | None:
-    """Return the command that continues the run with fewer steps; None if both have as many.
+    """Return the command that continues the shorter of the two runs; None if they are equally long.
 
-    A comparison of feeds needs equally many steps.
+    The comparison of their feeds needs the same number of steps.
     """
     steps = {path: steps_of(path) for path in (to.run, fed_uniformly(to))}
     behind, ahead = sorted(steps, key=lambda path: steps[path])
     if steps[behind] == steps[ahead]:
         return None
-    longest_s = f"{10 * to.seconds + 600:g}"  # so long that the steps end it
+    longest_s = f"{10 * to.seconds + 600:g}"  # long enough that the number of steps ends training
     budget = ("--env-steps", str(steps[ahead]), "--seconds", longest_s)
     return ["train", "--resume", str(behind), *budget]
 
@@ -249,7 +249,7 @@ SAMPLE_OF_ONE = (
     " same probability.",
     "One seed each is a sample of one: docs/evidence.md has ten, and what 128,000 steps gave.",
 )
-UPDATES = 2000  # of the policy from the logs alone: as many as other runs make before they drive
+UPDATES = 2000  # of the run on logs alone: as many as other runs make before driving
 
 
 def before_and_after(evaluated: Document) -> list[dict[str, str]]:

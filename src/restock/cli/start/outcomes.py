@@ -174,7 +174,7 @@ def nominal_verdict(document: Document) -> Mapping[str, Any] | None:
 
 
 def train(document: Document) -> list[str]:
-    """Say how much the policy learned from, and what was kept."""
+    """Count updates and steps in the twin, and show the success of the kept policy."""
     twin = f", {document['env_steps']:,} steps in the twin" if document["env_steps"] else ""
     lines = [f"{document['gradient_steps']:,} updates{twin}, {_format_time(document['wall_s'])}"]
     best = document["best"]

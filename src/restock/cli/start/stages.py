@@ -29,12 +29,12 @@ class Stage:
     outcome: Callable[[Document], list[str]] = lambda document: []  # summary in a few lines
     shows_progress: bool = False  # for a stage that takes minutes
     resume: tuple[str, ...] = ()  # the command that continues an interrupted stage
-    beside: tuple[str, ...] = ()  # a command that runs at the same time
+    beside: tuple[str, ...] = ()  # a command that runs in parallel
     # The command if it depends on earlier stages; None: there is nothing to do.
     decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
-        """Return the command as a user types it, below the command that runs beside it."""
+        """Return the command as a user types it; first the parallel command, if there is one."""
         beside = f"restock {shlex.join(self.beside)} &\n" if self.beside else ""
         return f"{beside}restock {shlex.join(self.command)}"
 
@@ -109,7 +109,7 @@ class Settings:
 
 
 def own_file(name: Path | str | None) -> tuple[Path, ...]:
-    """Return the file with this name; empty if there is none, as for a shipped name."""
+    """Return the user's file, in a tuple; empty if the name is None or that of a shipped file."""
     return () if name is None or not Path(name).is_file() else (Path(name),)
 
 
@@ -119,7 +119,7 @@ def info(to: Settings) -> Stage:
         "What is in these recordings?",
         ["info", *to.logs, *to.read_options],
         reads=to.files_read,
-        expected=(0, 3),  # 3: damaged, and read as far as it is intact
+        expected=(0, 3),  # 3: the recording is damaged; its intact part was read
         outcome=outcomes.info,
     )
 
@@ -213,7 +213,7 @@ def fit(to: Settings, horizon_s: float) -> Stage:
 
 
 def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
-    """Measure how far from the log the twin ends when it drives the logged commands."""
+    """Measure how far the twin and the logged robot drift apart under the same commands."""
     calibrated = ("--perturbation", str(to.fitted)) if fitted else ()
     few = ("--segments", "100", "--horizon-s", f"{horizon_s:g}")
     folder = to.store / "gap"

@@ -17,7 +17,7 @@ from restock.cli.start.work import StageResult, Work, escape, make_printer
 from restock.cli.words import Option, Positional, Repeated
 from restock.errors import ConfigError, ExitCode, RecordingError, quoted
 
-HELD_OUT = "evaluation split"  # a panel's reason to leave out rows: the policy is evaluated on them
+HELD_OUT = "evaluation split"  # in a panel's reason for rows that it holds out to evaluate on
 AGAIN = "then run the same command again: finished stages are kept"
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
@@ -46,7 +46,7 @@ class Pipeline:
         )
 
     def go(self) -> Stop | None:
-        """Run all stages; return why and what to do if a person must decide."""
+        """Run all stages; return a Stop if a person must decide, else None."""
         try:
             readable = self._recordings()
             self._profile(readable)
@@ -75,7 +75,7 @@ class Pipeline:
         return readable
 
     def _longest(self, recordings: list[Document]) -> str:
-        """Return the longest of these recordings; `first` if there are none."""
+        """Return the path of the longest of these recordings; `self.first` if there are none."""
         times = {row["path"]: row["duration_s"] or 0.0 for row in recordings}
         return str(max(times, key=times.__getitem__, default=self.first))
 
@@ -299,10 +299,10 @@ class StartCommand:
         return int(ExitCode.LOSSY)
 
     def _expect_a_recording(self) -> str:
-        """Return the first path, or file in a folder, that begins like a recording.
+        """Return the first recording at the paths, judged by names and first bytes of files.
 
         Raises:
-            RecordingError: nothing at a path looks like a recording, or no file is one.
+            RecordingError: nothing at a path looks like a recording, or no file begins like one.
         """
         from restock.ingest.containers.open_recording import recordings_in, reject_non_recording
 

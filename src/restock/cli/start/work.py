@@ -52,11 +52,11 @@ class StageResult:
 
     @property
     def good(self) -> bool:
-        """Return whether the next stages can build on it."""
+        """Return whether later stages can use the result: the stage did not fail."""
         return self.status != "failed"
 
     def summary(self) -> dict[str, Any]:
-        """Return the result without the document of its verb."""
+        """Return the result as JSON values, without `document`, which has a file of its own."""
         return {key: value for key, value in asdict(self).items() if key != "document"}
 
 
@@ -180,7 +180,7 @@ class Work:
         known = self._records.get(stage.name, {})
         if known.get("status") != "done" or known.get("stamp") != stamp:
             return None
-        if any(ended.status == "done" for ended in self.ended):  # an earlier stage was run again
+        if any(ended.status == "done" for ended in self.ended):  # an earlier stage ran anew
             return None
         document = self._document(stage)
         if not all(path.exists() for path in (*stage.writes, document)):
@@ -227,7 +227,7 @@ def _run_beside(stage: Stage) -> Iterator[Callable[[], int]]:
     if not stage.beside:
         yield lambda: int(ExitCode.OK)
         return
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # one core for each of the two
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # one core for each of the two commands
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
             [sys.executable, "-m", "restock", *stage.beside],
@@ -265,7 +265,7 @@ class _Tee:
 
 
 def make_printer(console: Console) -> Callable[[str], None]:
-    """Return a function that prints a line of markup and flushes it, so that stderr comes after."""
+    """Return a function that prints a line of markup, and flushes it before stderr is written."""
 
     def say(line: str) -> None:
         console.print(line, soft_wrap=True)
@@ -288,7 +288,7 @@ def _parse(text: str) -> Any:
 
 
 def _fingerprint(path: Path) -> str:
-    """Return names, sizes and times of a user's file or folder, as text to compare."""
+    """Return names, sizes and times of the files at a path, as text that changes with them."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     parts = []
     for file in filter(Path.is_file, files):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from restock.replay.fleet.missions_file import MissionsFile
     from restock.train.twin.env.interface import Policy
 
-LEARNED = "dqn"  # behaviour policy's name for a policy that `restock train` made
+LEARNED = "dqn"  # `behaviour_policy` of recordings driven by a policy of `restock train`
 
 
 @dataclass
@@ -148,7 +148,7 @@ class RecordCommand:
             _print_recording(done)
 
     def _format(self) -> Literal["mcap", "rosbag2"]:
-        ending = self.out.suffix[1:]  # drive.2026-10-05 is the name of a folder
+        ending = self.out.suffix[1:]  # "drive.2026-10-05" is a valid folder: no ending
         if ending != "mcap" and ending.isalnum() and not ending.isdigit():
             raise ConfigError(
                 f"{self.out} is not the name of a recording",
@@ -189,7 +189,7 @@ def load_policy(name: str) -> Policy | None:
             where="--policy",
             remedy=f"choose one of {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
         )
-    if policy.version:  # made by Restock, so a run and a file with the same policy get the same tag
+    if policy.version:  # by Restock: a run and its exported ONNX file get the same tag
         policy.name = LEARNED
     else:
         file = Path(name.removeprefix("onnx:"))
