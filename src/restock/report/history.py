@@ -27,7 +27,7 @@ from restock.train.run.run import Run
 DEPTH = 3  # levels of subfolders that are searched for runs and stores
 MAX_SETTINGS = 6  # settings named in one line
 CLEAN = ("none", "nominal")  # both mean "without a perturbation"
-_SOFTWARE = ("free", "software")  # kinds of settings that are not meant to change a result
+_SOFTWARE = ("free", "software")  # kinds of settings that should not change results
 T = TypeVar("T")
 
 
@@ -231,7 +231,7 @@ def _changes_section(runs: Sequence[_RunSummary], changes: Rows) -> Section | No
 
 
 def _settings(differences: Rows) -> str:
-    """Name the settings that differ, with both values; the panel has a column of its own."""
+    """Name the settings that differ, with both values; another column describes the panels."""
     shown = [
         f"{row['setting'].removeprefix('config.')} {row['first']} → {row['second']}"
         for row in differences

@@ -35,7 +35,7 @@ SHARE_COLOURS = {"held": "#0f766e", "by priority": "#94a3b8"}
 MAX_ROBOTS = 12  # in a chart
 MAX_PERIODS = 26  # a chart shows the newest
 MAX_FINDINGS = 8  # findings with a chart of their own
-_BESIDE = ("driving", "conditions")  # parts that describe use, not hardware
+_BESIDE = ("driving", "conditions")  # parts of findings on use, not hardware
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
@@ -184,7 +184,7 @@ def _strangest(store: Store, place: str) -> Section | None:
 
 
 def coverage_weeks(store: Store) -> tuple[Rows, Section | None]:
-    """Return the rows of the statement `weeks`, and their section; None if all counts are zero."""
+    """Return rows by week and condition, and a section that shows them; None if all are zero."""
     every = _rows(store, "weeks")
     rows = [row for row in every if row["primary_rows"]]
     if not rows:
@@ -350,7 +350,7 @@ def drift_headline(drift: Drift) -> str:
 
 
 def drift_section(drift: Drift) -> Section:
-    """Show each finding with its size and date, and the weeks behind it."""
+    """Show each finding with its size and date, and charts of its signal over the periods."""
     robots = {row["robot"] for row in drift.periods}
     periods = {row["period"] for row in drift.periods}
     rows = [

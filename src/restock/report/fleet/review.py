@@ -49,7 +49,7 @@ def page_data(store: Store) -> dict[str, Any]:
 
 
 def review_html(data: dict[str, Any]) -> tuple[str, str]:
-    """Return the page and its Content-Security-Policy: its own script and server only."""
+    """Return the page, and a Content-Security-Policy that allows only its own script and server."""
     folder = files("restock.report.look")
     script, style, own, text = (
         (folder / name).read_text(encoding="utf-8")
@@ -75,7 +75,7 @@ def review_html(data: dict[str, Any]) -> tuple[str, str]:
 
 PORT = 7474  # used if it is free, so that an SSH tunnel can be set up in advance
 HOSTS = ("127.0.0.1", "localhost")
-NOTHING = "default-src 'none'"  # the policy of an answer that is not a page
+NOTHING = "default-src 'none'"  # Content-Security-Policy of JSON answers
 MAX_BODY_BYTES = 256 << 10
 
 
@@ -92,7 +92,6 @@ class Review:
         self._lock = threading.RLock()  # store and journal are not thread-safe
 
     def close(self) -> None:
-        """Close the stores."""
         for store in {self.store, self._now}:
             store.close()
 
@@ -131,7 +130,7 @@ class Review:
             self.journal.append([msgspec.structs.replace(one, at="") for one in entries])
 
     def write(self) -> Written:
-        """Write the journal's verdicts that count into the store."""
+        """Write verdicts into the store, except those replaced, taken back or already written."""
         with self._lock:
             return write_verdicts(self.journal, self.place)
 
@@ -176,7 +175,7 @@ class Server(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request of the page."""
+    """Answers the requests of the review page."""
 
     server: Server
     protocol_version = "HTTP/1.1"
@@ -213,7 +212,7 @@ class Handler(BaseHTTPRequestHandler):
                 self._send(409, json.dumps({"error": str(error)}))
 
     def _refuse(self, why: str) -> None:
-        self.close_connection = True  # the request's body was not read
+        self.close_connection = True  # the unread body would be taken for the next request
         self._send(403, json.dumps({"error": why}))
 
     def _get(self, path: str) -> None:

@@ -17,7 +17,7 @@ from restock.stats import interval_text
 from restock.train.twin.missions import MISSIONS
 
 Rows = list[dict[str, Any]]
-BROAD = 4  # a phone shows the rows of a table with more columns than this as lists
+BROAD = 4  # on a phone, a table with more columns than this is shown as one list per row
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Drawing:
     The page shows the widest that fits.
     """
 
-    svg: dict[int, str]  # by width
-    spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # Vega-Lite; empty for a map
+    svg: dict[int, str]  # width -> SVG text
+    spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # width -> Vega-Lite; maps: {}
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def named(rows: Rows) -> str:
 
 
 def better_and_worse(rows: Rows, than: str = "") -> tuple[list[str], int]:
-    """Name and count the conditions that differ: those whose interval excludes zero."""
+    """Return sentences that name the conditions whose interval excludes zero, and their number."""
     better = [row for row in rows if row["difference_low"] > 0]
     worse = [row for row in rows if row["difference_high"] < 0]
     both = ("better", better), ("worse", worse)
@@ -245,7 +245,7 @@ def palette(
 
 
 DARK = {  # colour in the light theme -> in the dark theme
-    # ink, rules and grounds
+    # text, lines and backgrounds
     "#0f172a": "#e8edf4",
     "#334155": "#cbd5e1",
     "#475569": "#a3b1c6",
@@ -255,7 +255,7 @@ DARK = {  # colour in the light theme -> in the dark theme
     "#e2e8f0": "#2b3a52",
     "#f8fafc": "#101a2d",
     "#ffffff": "#16213a",
-    # series
+    # data series
     "#111827": "#e5e7eb",
     "#6b7280": "#a1a8b5",
     "#9ca3af": "#7f8795",

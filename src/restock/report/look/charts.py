@@ -44,7 +44,7 @@ POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d", "#cc79a7
 
 FEW_POINTS = 10  # a line with fewer points than this shows each of them
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
-SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; an axis' `format` would write 0k
+SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; `format="~s"` of an axis would write 0k
 LETTER_PX = 5.8  # approximate width of a letter of a label
 WIDER_FONT = 0.15  # the reader's font may make a label wider by this share
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
@@ -98,7 +98,7 @@ def _shown(value: Any) -> Any:
 def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawing:
     """Draw a chart at several widths; `chart_of` makes the chart for a width.
 
-    A chart is fitted to the width with its axes and legend. A facet sets widths of its own.
+    The width includes axes and legend. Facet charts are not fitted: `chart_of` sets their widths.
     """
     spec = {width: _fitted(chart_of(width), width) for width in widths}
     return Drawing({width: _svg(one) for width, one in spec.items()}, spec)
@@ -121,7 +121,7 @@ def _svg(spec: dict[str, Any]) -> str:
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     """Place a legend above the chart, in as many columns as fit beside its axis labels."""
     longest = max((len(name) for name in names), default=1) * LETTER_PX
-    apart = 10 + WIDER_FONT * longest  # between columns: the reader's font may be wider than ours
+    apart = 10 + WIDER_FONT * longest  # between columns, with room for a wider font
     columns = max(1, min(len(names), int((width - labels_px) // (longest + 26 + apart))))
     # Names often differ only at the end: cut a name only if the chart is too narrow for it.
     limit = max(width - labels_px - 30, 160)
@@ -279,7 +279,7 @@ def lines(
         layers = [line]
         if marker is not None:
             at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
-            early = marker < max(row[x] for row in rows) / 2  # no room for the text on its left
+            early = marker < max(row[x] for row in rows) / 2  # the text fits only on the right
             layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
             layers.append(
                 at.mark_text(
@@ -385,7 +385,7 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
 
     def chart(width: int) -> Any:
         most = 1 if width < 600 else 2 if width < 900 else 4
-        across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # evened out
+        across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # equal rows
         base = plot(shown).encode(
             x=alt.X("env_steps:Q", title="environment steps", axis=x_axis(width // across)),
             color=coloured("arm", arms, POLICY_COLOURS, width),

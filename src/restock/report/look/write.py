@@ -141,7 +141,7 @@ class Charts:
 
 
 def policy(charts: bool) -> str:
-    """Return the page's Content-Security-Policy: no fetches, no scripts except its own two."""
+    """Return the page's Content-Security-Policy: no fetches; no scripts, or only the page's two."""
     scripts = " ".join(_hash(text) for text in (_script(), _runtime())) if charts else "'none'"
     return (
         "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
@@ -152,7 +152,7 @@ def policy(charts: bool) -> str:
 def live(spec: Spec) -> Spec:
     """Make the specification of a chart interactive.
 
-    Vega-Lite makes the tooltips (`charts.CONFIG`); a line gets transparent points to show them at.
+    `charts.CONFIG` turns on tooltips. Lines get transparent points, because tooltips need points.
     A click on a name in the legend shows that series alone; a second click shows all series again.
     """
     found = deepcopy(spec)

@@ -20,7 +20,7 @@ from restock.report.look.blocks import (
 from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
 from restock.train.judge.sequential import NOT_SHOWN, NOT_WORSE, WORSE
 
-MAX_SETTINGS = 4  # a sentence names at most this many differing settings, or none
+MAX_SETTINGS = 4  # if more settings differ, the sentence names none of them
 FREE_KINDS = ("free", "software")
 _ALLOWED = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
@@ -102,7 +102,7 @@ def outcome_section(found: dict[str, Any], first: str, second: str, prefix: str 
 
 def _treatment(found: dict[str, Any]) -> str:
     """Describe the treatment and, for a comparison of methods, what was held fixed."""
-    names: dict[str, list[str]] = {}  # by kind
+    names: dict[str, list[str]] = {}  # kind of setting -> differing settings
     for row in found["differences"]:
         name = row["setting"].removeprefix("config.")
         kind = names.setdefault(row["kind"], [])

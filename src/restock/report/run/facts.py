@@ -66,7 +66,7 @@ class Facts:
     floors: Sequence[Warehouse] = ()  # the floors that the run drives on
     logged: Rows = field(default_factory=list)  # share of logged episodes per condition
     gap: TwinGap | None = None  # between the twin and the logs
-    missing: list[str] = field(default_factory=list)  # what could not be read, and why
+    missing: list[str] = field(default_factory=list)  # notes on what could not be read, and why
 
     @property
     def target_rule(self) -> str:
@@ -116,7 +116,7 @@ def gather(path: Path) -> Facts:
             remedy="let it train past its first logging interval",
         )
     (clocks,) = rows.pop("clocks")
-    latest = run_clocks(run)  # an interrupted run is past its last logged interval
+    latest = run_clocks(run)  # may be later than the last logged interval
     twin, taught = _has_twin(run.document), run.table("teacher").to_pylist()
     facts = Facts(
         run=path,
@@ -161,8 +161,8 @@ def _find_gap(facts: Facts) -> TwinGap | None:
 def _off_policy(run: Run, twin: bool) -> Rows:
     """Return off-policy estimates on held-out logs, over all conditions.
 
-    With a twin, they are for the policy that began to drive there (table `off_policy`). Without
-    one, they are for the kept policy if `restock eval` estimated it.
+    The run's table `off_policy` estimates the policy that the logs gave, before it drove in the
+    twin. Without a twin, estimates of the kept policy by `restock eval` are preferred.
     """
     kept = run.path / "eval" / "off_policy.parquet"
     table = run.table("off_policy") if twin or not kept.is_file() else read_table(kept)
@@ -194,7 +194,7 @@ def _add_panel(facts: Facts) -> None:
 def _floors(facts: Facts) -> tuple[Warehouse, ...]:
     """Return the run's floors; empty if it has none, or if they cannot be read."""
     layouts = facts.config.get("config", {}).get("env", {}).get("layouts", DEFAULT)
-    if not facts.twin and layouts == DEFAULT:  # the logs are from another floor
+    if not facts.twin and layouts == DEFAULT:  # the logs are not from the default floor
         return ()
     try:
         return open_floors(layouts)

@@ -32,7 +32,7 @@ _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planne
 
 
 def headline(facts: Facts) -> str:
-    """State the result in one sentence, and the training step of the policy if it matters."""
+    """State the result in a sentence; name the policy that drove if it is not the best and last."""
     if not facts.twin:
         return _headline_of_logs(facts)
     if not facts.clean_cells():
@@ -60,7 +60,7 @@ def _result(facts: Facts) -> str:
 
 
 def _policy_step(facts: Facts) -> str:
-    """State which policy drove; empty if it is the best one and from the end of the run."""
+    """State which policy drove; empty if it is the best one, and was trained to the last step."""
     step, policy = facts.driven_step, facts.policy
     if step is None or policy is None:
         return ""
@@ -79,9 +79,9 @@ def baseline(facts: Facts) -> str | None:
 
 
 def compare_with(facts: Facts, name: str | None) -> Rows:
-    """Compare the agent with another policy by perturbation and condition, as rows of `paired`.
+    """Compare the agent with policy `name` by perturbation and condition, as rows of `paired`.
 
-    Empty if there is no other policy, if it was not evaluated, or if the task has no goal.
+    Return [] if `name` is None, if one of the two was not evaluated, or if the task has no goal.
     """
     if name is None or facts.no_goal:
         return []
@@ -131,7 +131,7 @@ def _against_baseline(facts: Facts) -> str:
 
 
 def _warn_of_gap(facts: Facts) -> str:
-    """Warn that success in the twin may mean little, if its gap in nominal driving is large."""
+    """Warn that success in the twin may mean little, unless nominal driving in it is trusted."""
     verdicts = () if facts.gap is None else facts.gap.verdicts
     nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
     if nominal == TRUSTED:
@@ -176,7 +176,7 @@ def _headline_of_logs(facts: Facts) -> str:
         return "Trained on the logs alone, not yet evaluated"
     measure = "success" if any(name == "success" for name, _ in rows) else "return"
     logged = rows.get((measure, "logged"))
-    judged = rows.get((measure, "pdwis"))  # the estimator with an interval
+    judged = rows.get((measure, "pdwis"))  # the estimator that has an interval
     if logged is None or judged is None or judged["value"] is None:
         return "Trained on the logs alone: there are too few to evaluate it"
     return (

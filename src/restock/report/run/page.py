@@ -218,7 +218,7 @@ def in_words(value: Any, name: str = "", *, inside: bool = False) -> str:
 
 
 def _newest(facts: Facts) -> str:
-    """Describe the age of the panel's newest row: no logged row can be more recent."""
+    """Describe the age of the panel's newest row when training began; empty if unknown."""
     began_ns = facts.config.get("created_ns")
     if facts.panel is None or began_ns is None:
         return ""

@@ -57,7 +57,7 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "lead": f"{counted(about['rows'], 'logged step')} of"
         f" {counted(about['episodes'], 'episode')}, driven again in the twin. Verdicts are on"
         f" the {source_name(about['judged'])}.",
-        "sections": [replace(gap_section(gap), callout="")],  # the headline says it
+        "sections": [replace(gap_section(gap), callout="")],  # as in the headline
         "source": f"{about['store']}, version {about['store_version']}",
     }
 
