@@ -49,8 +49,8 @@ def open(path: str | Path, *, version: int | str | None = None) -> Store | Place
     """Open a store, a run, a panel or recordings: `restock.open("store").sql("FROM coverage")`.
 
     The result has `.sql(query)`, `.coverage()` and `.show()`. Recordings are a file, a folder or a
-    glob. `version` is a version of a store: its number, or an ISO 8601 time. `"store@12"` does the
-    same.
+    glob. `version` selects a version of a store, by its number or an ISO 8601 time. The path
+    `"store@12"` selects version 12, too.
     """
     from glob import has_magic
 

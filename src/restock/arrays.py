@@ -18,7 +18,7 @@ Bools = NDArray[np.bool_]
 
 
 def stacked(*columns: NDArray[Any]) -> NDArray[Any]:
-    """Return arrays (...) of one shape and type as one (..., K): `np.stack` for small arrays."""
+    """Stack K arrays of the same shape (...) into one (..., K); faster than `np.stack` if small."""
     joined = np.empty((*columns[0].shape, len(columns)), columns[0].dtype)
     for place, column in enumerate(columns):
         joined[..., place] = column

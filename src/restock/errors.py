@@ -23,10 +23,10 @@ def reported(text: str, keep: str = "") -> str:
 
 
 def visible(text: str, keep: str = "") -> str:
-    """Escape the control characters in a text, except those in `keep`: `\\x1b[2J`.
+    """Escape the control characters in a text, except those in `keep`.
 
-    A terminal would obey them: the name of a topic could clear the screen, or imitate another line.
-    Characters that change the direction of text are escaped, too.
+    A terminal obeys them: the name of a topic could clear the screen (`\\x1b[2J`), or imitate
+    another line. Characters that change the direction of text are escaped, too.
     """
     if text.isprintable():
         return text
@@ -79,7 +79,7 @@ class RestockError(Exception):
     exit_code = ExitCode.USAGE
 
     def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
-        # Both may quote text from files and from users, and are printed on a terminal.
+        # Messages may quote text of files and users, and are printed on a terminal.
         what, remedy = reported(what, keep="\n"), remedy and reported(remedy, keep="\n")
         where = where and reported(where)
         self.what, self.where, self.remedy = what, where, remedy
@@ -90,7 +90,7 @@ class RestockError(Exception):
 
 
 def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str) -> None:
-    """Check the type of an argument: it may be a path in place of the opened object.
+    """Check the type of an argument: callers may pass a path where an opened object is needed.
 
     Raises:
         ArgumentError: the argument is not of type `kind`.
@@ -162,7 +162,7 @@ def uncertain_labels(conditions: Iterable[str], recordings: int) -> str:
 
 
 def by_priority(conditions: Iterable[str]) -> str:
-    """Return a note on how a row with several conditions is counted, by their order."""
+    """Return a note: a row with several conditions counts once, for the first in this order."""
     return (
         "By priority, a row that holds several conditions counts once, for the first of "
         + ", ".join(conditions)

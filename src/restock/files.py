@@ -126,7 +126,7 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
 
 
 def _takes_a_stream(path: Path) -> bool:
-    """Return whether a path is written to, not replaced: /dev/stdout, /dev/null, a named pipe."""
+    """Return whether to write into a path (/dev/stdout, a named pipe), and not to replace it."""
     if path.is_symlink() and str(path.readlink()).startswith("/proc/self/fd"):
         return True
     return path.exists() and not path.is_file() and not path.is_dir()
@@ -162,11 +162,11 @@ def expect_file_place(path: Path | None, option: str, *, run: Path | None = None
 
 
 def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
-    """Check that a new folder can be made at `path`, and would not be removed with another one.
+    """Check that a new folder can be made at `path`, outside of any panel, store and run.
 
     Raises:
-        RestockError: (of type `error`) a file or missing permissions prevent it, or the path is
-            inside a panel, a store or a run, and would be removed with it.
+        RestockError: (of type `error`) the folder cannot be made there, or `path` is inside a
+            panel, a store or a run, and would be removed together with it.
     """
     absolute = path.absolute()
     parent = next(folder for folder in absolute.parents if folder.exists())
@@ -197,7 +197,7 @@ def is_undecoded(letter: str) -> bool:
 
 
 def _temporary(path: Path, *, replaces: bool = True) -> Path:
-    if replaces and path.is_dir():  # else the error would name the temporary file
+    if replaces and path.is_dir():  # the later error would name the temporary file
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     return temporary_name(path)
@@ -211,8 +211,8 @@ def temporary_name(path: Path) -> Path:
 def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
     """Remove temporary files that killed processes left in `folder`; return the removed ones.
 
-    `pattern` is a glob for the final names. Only names made by `temporary_name` are removed, and
-    none of another process that is still running.
+    `pattern` is a glob for the final names. Only names made by `temporary_name` are removed. Files
+    of other processes that are still running stay.
     """
     removed = []
     for path in folder.glob(f".{pattern}.*.tmp"):

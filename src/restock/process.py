@@ -91,7 +91,7 @@ def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _by_interrupt(error: BaseException | None, before: BaseException | None) -> bool:
-    """Return whether an error or its cause is an interrupt, or DuckDB's error for one."""
+    """Return whether an interrupt caused an error: look through its contexts, up to `before`."""
     while error is not None and error is not before:
         said = str(error)
         if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in said:
@@ -103,7 +103,7 @@ def _by_interrupt(error: BaseException | None, before: BaseException | None) -> 
 
 
 def went_on_after_interrupt() -> None:
-    """Record that the interrupt was handled: it does not explain later errors."""
+    """Record that the last interrupt was handled, so that `was_interrupted` returns False."""
     global _interrupted
     _interrupted = False
 
@@ -162,7 +162,7 @@ def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 
 def interrupt_running() -> None:
-    """Terminate the processes that other threads wait for: a thread gets no interrupt."""
+    """Terminate the processes in `ended_with_us` blocks, whose threads receive no interrupt."""
     for process in list(_running):
         process.send_signal(signal.SIGTERM)
 
@@ -221,13 +221,13 @@ def not_installed(name: str, use: str, extra: str = "") -> ConfigError:
 
 
 def install_command(extra: str = "") -> str:
-    """Return the pip command that installs an extra, or missing requirements, of this Restock."""
+    """Return the pip command that reinstalls Restock with an extra, or with its requirements."""
     import json
     from importlib.metadata import PackageNotFoundError, distribution
 
     try:
         origin = json.loads(distribution("restock").read_text("direct_url.json") or "{}")
-    except PackageNotFoundError:  # imported from a path
+    except PackageNotFoundError:  # a source tree that is not installed
         origin = {}
     extras = f"[{extra}]" if extra else ""
     if origin.get("dir_info", {}).get("editable"):

@@ -41,7 +41,7 @@ def lazy(face: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list
 
 
 def imported(face: str) -> dict[str, list[str]]:
-    """Return the `X as X` imports of a module by the module they come from, without importing."""
+    """Return module -> names that `face` imports from it as `X as X`; read from its source."""
     source = Path(str(sys.modules[face].__file__)).read_text(encoding="utf-8")
     names_by_module: dict[str, list[str]] = {}
     for node in ast.walk(ast.parse(source)):

@@ -20,17 +20,17 @@ from restock.errors import RunError
 class Stateful:
     """A class whose attributes in `STATE` are saved and restored.
 
-    Attributes in `SAME` are saved as well; a state with other values of them is refused. Subclasses
+    Attributes in `SAME` are saved as well; loading fails if their values differ. Subclasses
     override `restored` to recompute what depends on the state.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
     SAME: ClassVar[tuple[str, ...]] = ()
-    # Types of attributes whose current value does not show the type: `list[EpisodeSpec]`.
+    # Attribute -> type, if its current value does not show the type, as an empty list of structs.
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return arrays and JSON values, keyed by the names (without a leading underscore)."""
+        """Return arrays and JSON values by attribute name, without a leading underscore."""
         return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -74,11 +74,11 @@ def saved(value: Any) -> Any:
         return value.bit_generator.state
     if isinstance(value, Stateful):
         return value.state_dict()
-    if hasattr(value, "state_dict"):  # a torch module gives its own tensors
+    if hasattr(value, "state_dict"):  # a torch module or optimizer: copy the tensors it returns
         return saved(dict(value.state_dict()))
     if hasattr(value, "detach"):  # a tensor
         return value.detach().cpu().clone()
-    if hasattr(value, "get_state"):  # torch's generator
+    if hasattr(value, "get_state"):  # a torch.Generator
         return value.get_state().clone()
     if isinstance(value, np.ndarray):
         return value.copy()
@@ -88,7 +88,7 @@ def saved(value: Any) -> Any:
         return msgspec.to_builtins(value)
     if is_dataclass(value):
         return {field.name: saved(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):  # in JSON, every key is a string
+    if isinstance(value, Mapping):  # JSON needs strings as keys
         return {str(name): saved(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [saved(item) for item in value]
@@ -96,7 +96,7 @@ def saved(value: Any) -> Any:
 
 
 def first_mismatch(error: RuntimeError) -> str:
-    """Return the first mismatch that PyTorch reports about the weights of another network."""
+    """Return the first mismatch of names or shapes from PyTorch's error about loaded weights."""
     lines = str(error).splitlines()
     return lines[min(1, len(lines) - 1)].strip()
 
@@ -109,7 +109,7 @@ def restored(current: Any, state: Any) -> Any:
     if hasattr(current, "load_state_dict"):
         try:
             current.load_state_dict(state)
-        except RuntimeError as error:  # PyTorch's
+        except RuntimeError as error:  # raised by torch.nn.Module
             raise RunError(
                 f"the saved state is of another network: {first_mismatch(error)}",
                 remedy="give the settings and the task that it was saved with",

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
-CONFIDENCE = 0.95  # of every interval
-TAILS = [(1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2]  # the quantiles at its ends
+CONFIDENCE = 0.95  # confidence level of all intervals
+TAILS = [(1 - CONFIDENCE) / 2, 1 - (1 - CONFIDENCE) / 2]  # quantiles at an interval's ends
 MIN_PAIRS = 3  # with fewer pairs, `paired_t` returns only the mean
 _WEIGHTS_AT_ONCE = 4_000_000  # bootstrap weights that are held in memory at a time
 
@@ -180,14 +180,14 @@ def difference_of_arms(
     value, episodes = float(second.mean() - first.mean()), first.shape[1]
     if min(len(first), len(second), episodes) < 2:
         return ConfidenceInterval(value, float("nan"), float("nan"))
-    parts = [  # variance of the difference, with degrees of freedom
+    parts = [  # variance of the difference and degrees of freedom: episodes, runs of each arm
         (float(np.var(second.mean(axis=0) - first.mean(axis=0), ddof=1)) / episodes, episodes - 1),
         *(
             (float(np.var(arm.mean(axis=1), ddof=1)) / len(arm), len(arm) - 1)
             for arm in (first, second)
         ),
     ]
-    # The interaction of runs and episodes is part of each variance, and must count once.
+    # The interaction of runs and episodes is in the variances of both sources: subtract it once.
     both = sum(_interaction(arm) / arm.size for arm in (first, second))
     variance = max(sum(part for part, _ in parts) - both, max(part for part, _ in parts))
     if variance == 0:
@@ -198,7 +198,7 @@ def difference_of_arms(
 
 
 def _interaction(arm: F64) -> float:
-    """Return the variance of values (runs, episodes) that neither run nor episode explains."""
+    """Return the residual variance of values (runs, episodes) after run and episode means."""
     left = arm - arm.mean(axis=1, keepdims=True) - arm.mean(axis=0, keepdims=True) + arm.mean()
     return float((left**2).sum() / ((arm.shape[0] - 1) * (arm.shape[1] - 1)))
 
@@ -259,10 +259,10 @@ def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F
 def for_few_clusters(interval: ConfidenceInterval, clusters: int) -> ConfidenceInterval:
     """Return the percentile interval of a bootstrap over C clusters, widened for small C.
 
-    The percentile interval is too narrow for small C: the variance of a draw is (C - 1) / C of the
-    true one, and the spread is itself an estimate. The distance of each end from the value is
-    multiplied by t / z * sqrt(C / (C - 1)), with the quantiles of Student's t (C - 1 degrees of
-    freedom) and of the normal distribution.
+    The interval is too narrow for small C: the variance of a bootstrap draw is (C - 1) / C of the
+    statistic's variance, and the spread is itself an estimate. The distance of each end from the
+    value is multiplied by t / z * sqrt(C / (C - 1)), where t is the quantile of Student's t with
+    C - 1 degrees of freedom and z that of the normal distribution.
     """
     from scipy.stats import t
 
@@ -287,8 +287,8 @@ def clustered_quantiles(
 ) -> list[ConfidenceInterval]:
     """Return quantiles of values (N,) in clusters (N,); each value has the same weight.
 
-    A quantile is the smallest value with at least that share of the values at or below it. The ends
-    are NaN if there is only one cluster, because there is nothing to resample.
+    The quantile of a share in `shares` is the smallest value with at least that share of values at
+    or below it. With only one cluster there is nothing to resample, and the ends are NaN.
     """
     values = np.asarray(values, np.float64)
     if not len(values):

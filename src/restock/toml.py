@@ -24,14 +24,14 @@ from msgspec import inspect as kinds
 from restock.errors import ConfigError
 
 T = TypeVar("T")
-_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # first step of a path in msgspec's messages, rest
+_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # path in msgspec's errors: first step, rest
 MAX_NAMED = 12  # an error lists the known keys of a table if there are at most this many
-MAX_DEPTH = 64  # of nested tables and arrays
+MAX_DEPTH = 64  # levels of nested tables and arrays
 _DEEP_KEY = re.compile(rf"""(?<![\w"'.-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_DEPTH},}}""")
 
 
 class ValueRefused(ConfigError, ValueError):
-    """A value that a struct refuses; as a ValueError, so that msgspec adds the key to it."""
+    """A value that a struct refuses. It is a ValueError, to which msgspec adds the key."""
 
 
 class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -145,7 +145,7 @@ def _key(name: str) -> str:
 
 @functools.cache
 def _ranges(kind: type) -> dict[str, kinds.Type]:
-    """Return the fields of a struct that are numbers to check, or contain some."""
+    """Return name -> type of a struct's fields that are numbers, or contain numbers."""
     info = kinds.type_info(kind)
     assert isinstance(info, kinds.StructType)
     return {f.name: f.type for f in info.fields if _ranged(f.type)}
@@ -257,7 +257,7 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
                 return f"{_join(prefix, name)} must be {_range_in_words(bounds)}, got {value}"
     if re.match(r"Expected `|Invalid ", what) or not path:
         choices = sorted(set(_choices(kind, document, path)))
-        if choices and choices[0].startswith('"'):  # names stand before other kinds
+        if choices and choices[0].startswith('"'):  # quoted names are sorted first
             what += f"; choose from {', '.join(choices)}"
         return f"`{key}`: {what}" if key else what
     # The message of a struct's `check` begins with a field: `margin …` becomes `loss.margin …`.
@@ -302,9 +302,9 @@ def _choices(kind: Any, document: Any, path: str) -> Iterator[str]:
 def _places(
     kind: kinds.Type, value: Any, path: str, key: str = ""
 ) -> Iterator[tuple[kinds.Type, Any, str]]:
-    """Yield the type, value and key at the path in a message of msgspec.
+    """Yield each type, value and key to which the path in a message of msgspec may refer.
 
-    There are several if a type is a union, or if the path contains `[...]`, any key of a table.
+    There are several if a type is a union, or if the path contains `[...]` (any key of a table).
     """
     if isinstance(kind, kinds.UnionType):
         for option in kind.types:
@@ -334,7 +334,7 @@ def _places(
 
 
 def _has(document: Any, keys: list[str]) -> bool:
-    """Return whether a document has the key at a path; in an array of tables, if any table has."""
+    """Return whether a document has a value at a path of keys; in arrays, any item may have it."""
     if not keys:
         return True
     if isinstance(document, list):
@@ -362,9 +362,9 @@ def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> list[str]:
-    """Return the names of settings (of all, or of `names`) that differ from their defaults.
+    """Return which settings in `names` (all, if empty) differ from the struct's defaults.
 
-    `default` overrides the struct's own defaults.
+    `default` gives other defaults for some settings.
     """
     usual = type(settings)(**default)
     named = names or settings.__struct_fields__
