@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
-FIXED_FRAMES = ("map", "odom", "world")  # best first
+BASE_FRAMES = ("base_link", "base_footprint", "base")  # usual names of the base link, best first
+FIXED_FRAMES = ("map", "odom", "world")  # usual frames that do not move with the robot, best first
 F64 = NDArray[np.float64]
-MAX_LETTERS = 4_000_000  # characters of a description
+MAX_LETTERS = 4_000_000  # longest description, in characters
 MAX_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
-HEAVIEST_KG = 100_000.0  # of a link
+HEAVIEST_KG = 100_000.0  # a link with a larger mass counts as one without a mass
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Description:
     name: str
     links: dict[str, ET.Element]
     joints: list[Joint]
-    base: str  # name of the link whose pose is the robot's
+    base: str  # name of the link whose pose counts as the robot's pose
     root: ET.Element
 
     def places(self, kinds: Collection[str] = ANY) -> dict[str, Place]:
-        """Return the places of links that joints of these kinds connect to the base.
+        """Return the pose of each link that joints of these kinds alone connect to the base.
 
-        All joints are at position 0.
+        The poses are those with every joint at position 0.
         """
         children: dict[str, list[Joint]] = {}
         for joint in self.joints:
@@ -75,7 +75,7 @@ def read_description(text: str) -> Description | str:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         return "a robot's description must not declare entities"
     try:
-        robot = ET.fromstring(text)  # no entities: checked above
+        robot = ET.fromstring(text)  # safe: texts that declare entities were refused above
     except (ET.ParseError, ValueError) as error:
         return f"is not XML ({error})"
     if any(_is_xacro(element) for element in robot.iter()):
@@ -127,8 +127,8 @@ class Place:
     """The pose of a link in the base's frame."""
 
     rotation: F64  # (3, 3)
-    at_m: F64  # (3,)
-    rigid: bool  # only fixed joints lie between base and link
+    at_m: F64  # (3,) position
+    rigid: bool  # whether only fixed joints connect the link to the base
 
     def then(self, origin: ET.Element | None, *, rigid: bool = True) -> Place:
         xyz, rpy = (three(None if origin is None else origin.get(key)) for key in ("xyz", "rpy"))
@@ -137,9 +137,9 @@ class Place:
 
 
 def extent(link: ET.Element, place: Place) -> tuple[F64, F64] | None:
-    """Return the lowest and highest corner (3,) of a link's collision shapes, or else visual ones.
+    """Return the lowest and highest corner (3,) of the box around a link, in the base's frame.
 
-    None if no shape has a known size.
+    The box encloses the collision shapes, or else the visual ones; None if no size is known.
     """
     for kind in ("collision", "visual"):
         boxes = [
@@ -186,7 +186,7 @@ def three(text: str | None) -> F64:
 
 
 def lengths(text: str | None, count: int) -> F64:
-    """Parse exactly `count` numbers of 0 or more, (count,); all NaN if the text has others."""
+    """Parse `count` numbers of 0 or more, (count,); all are NaN if the text has anything else."""
     parts = (text or "").split(maxsplit=count)
     found = np.array([number(part) for part in parts[:count]])
     sound = len(parts) == count and bool((found >= 0).all())
@@ -194,7 +194,7 @@ def lengths(text: str | None, count: int) -> F64:
 
 
 def number(text: Any) -> float:
-    """Parse a number of a description; NaN, which makes an outline unknown, if it is invalid."""
+    """Parse a number of a description; an invalid one becomes NaN, so an outline is unknown."""
     try:
         return float(text) if abs(float(text)) < 1e6 else float("nan")
     except (TypeError, ValueError):

@@ -95,16 +95,16 @@ class Profile(Checked, frozen=True, dict=True):
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
-    behaviour_policy: str = "unknown"  # the driver, if no topic names it
-    # Behaviour policy -> its commands (a person's, navigation's), before one source is chosen.
+    behaviour_policy: str = "unknown"  # who drives, if no topic says so
+    # Possible driver (a person, navigation) -> its own commands, before one driver is chosen.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
-    # Topic of the chosen source's commands, if the robot's command is a smoothed or limited copy.
-    # The driver is the source whose command this topic repeats.
+    # If the robot smooths or limits the chosen driver's commands: their topic before that. The
+    # driver is then the one of `command_sources` whose command this topic repeats.
     command_through: Input | None = None
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
-    # Subtracted from poses, goals and plans in metres, for example in UTM coordinates.
+    # Point that is subtracted from all positions, as UTM coordinates are too large for float32.
     origin_m: tuple[float, float] | None = None
     frames: Frames | None = None
     motion: Motion | None = None
@@ -113,7 +113,7 @@ class Profile(Checked, frozen=True, dict=True):
     tags: TagRules = TagRules()
     noise: Noise = Noise()
     robot: Robot | None = None  # None: the twin's default robot
-    limiter: Limiter | None = None  # limits a policy's commands; None: by outline and actions
+    limiter: Limiter | None = None  # limits a policy's commands; None: from outline and actions
 
     @property
     def conditions(self) -> list[Condition]:
@@ -122,7 +122,7 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def exposures(self) -> list[Condition]:
-        """Return the exposures that label this robot's steps."""
+        """Return the exposures (situations known before acting) that label this robot's steps."""
         return self._conditions_of("exposure", self.shipped_exposures)
 
     @property
@@ -142,7 +142,7 @@ class Profile(Checked, frozen=True, dict=True):
         return [*self.conditions, *self.exposures]
 
     def shown_by_logs(self, conditions: Sequence[Condition]) -> list[Condition]:
-        """Return the conditions that are known on this robot's logged steps."""
+        """Return those of these conditions that this robot's logs suffice to evaluate."""
         in_hindsight = self.goal_source == "hindsight"
         return reported(conditions, lidar=self.task.lidar, driven_plan=in_hindsight)
 
@@ -154,8 +154,8 @@ class Profile(Checked, frozen=True, dict=True):
     def hash(self) -> str:
         """Return a hash of everything in the profile that rows depend on, 12 hex digits.
 
-        It leaves out the conditions and their [noise], as rows can be relabelled without the
-        recordings and have a `labels_version`; the [tags]; and what only the twin needs.
+        Not hashed are conditions and their [noise], as changing them only relabels rows, which
+        have a `labels_version` for it; the [tags]; and the tables [robot] and [limiter].
         """
         values = _without_none(msgspec.to_builtins(self))
         rest = {key: value for key, value in values.items() if key not in _NOT_IN_ROWS}
@@ -168,9 +168,9 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def sources(self) -> dict[str, Input]:
-        """Return the inputs, the sources of commands as `command_sources.NAME`, `command_through`.
+        """Return all inputs by name, including `command_sources.NAME` and `command_through`.
 
-        All but the inputs are optional, and so are goal and plan if the task has no goal.
+        These two kinds are optional, and so are goal and plan if the task has no goal.
         """
         optional = {
             name: msgspec.structs.replace(source, optional=True)
@@ -270,7 +270,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 
 def parse_profile(text: str, *, where: str) -> Profile:
-    """Parse a profile from TOML text that names no files; `where` names it in errors.
+    """Parse a profile from TOML text without references to files; `where` is its name in errors.
 
     Raises:
         ConfigError: the TOML is invalid.
@@ -281,7 +281,7 @@ def parse_profile(text: str, *, where: str) -> Profile:
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
     document = with_files(document, folder, where)
     signals = document.get("signals")
-    # Check each on its own first, as msgspec's error paths leave out the keys of nested tables.
+    # Check each table on its own first: msgspec's errors in the whole do not name nested tables.
     for name, table in signals.items() if isinstance(signals, dict) else ():
         typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
     cameras = document.get("cameras")
@@ -295,7 +295,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
             raise ConfigError(what, where=where)
     profile = typed(document, Profile, where=where)
     if not profile.inputs.scans:
-        profile = without_lidar(profile)  # it may give a number of sectors all the same
+        profile = without_lidar(profile)  # its task may still have a number of sectors
     check_profile(profile, where)
     return profile
 
@@ -335,7 +335,7 @@ def profile_toml(profile: Profile) -> str:
 
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
-    """Return the profile with these conditions instead; shipped ones are listed by name."""
+    """Return the profile with its conditions replaced by these; shipped ones appear by name."""
     known = shipped(profile.constants) | shipped(profile.constants, "exposure")
     named = [c for c in conditions if known.get(c.name) == c]
     return msgspec.structs.replace(
@@ -347,7 +347,7 @@ def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profil
 
 
 def _without_none(value: Any) -> Any:
-    """Return built-in values without None: TOML has no null, and None is always the default."""
+    """Drop None from built-in values: TOML has no null, and None is always the default."""
     if isinstance(value, dict):
         return {key: _without_none(item) for key, item in value.items() if item is not None}
     return [_without_none(item) for item in value] if isinstance(value, list | tuple) else value

@@ -42,18 +42,18 @@ NAMES = "name"  # field that holds the elements' names, as in sensor_msgs/JointS
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
 _ELEMENT = re.compile(r"(.+)\[(\d{1,6})\]")
 IN = " in "  # between a path and the unit of its values
-UNITS = {  # unit of a field -> other units, and their factor to convert to it
+UNITS = {  # unit that a field is stored in -> other allowed units -> factor to convert from these
     "mps": {"mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
     "radps": {"deg/s": math.pi / 180, "rpm": math.pi / 30},
 }
 
 
 class PathProblem(Exception):
-    """A path is invalid, or a message type lacks it; the text follows the path in messages."""
+    """A path is invalid, or a message type lacks it; users read the path and then this text."""
 
 
 def element_of(path: str) -> tuple[str, int | None]:
-    """Split the path of an element into field and index; the index of a whole field is None."""
+    """Split a path such as `covariance[0]` into field and index; None for a whole field."""
     field = path.partition(IN)[0]
     match = _ELEMENT.fullmatch(field)
     return (match[1], int(match[2])) if match else (field, None)
@@ -89,7 +89,7 @@ class Step:
 class PathValues:
     """The values (V,) that a path found in N messages, in the messages' order."""
 
-    message: Rows  # (V,)
+    message: Rows  # (V,) index of each value's message
     values: NDArray[Any]  # (V,)
 
 
@@ -124,7 +124,7 @@ class SignalPath:
         return sum(step.choice is not None and step.choice.many for step in self.steps)
 
     def leaf(self, upto: int | None = None, *more: str) -> str:
-        """Return the field path to decode, or that of the field `more` beside step `upto`."""
+        """Return the field path to decode, or that of the first `upto` steps and then `more`."""
         steps = self.steps[:upto]
         last = upto is None and not more
         names = [
@@ -134,7 +134,7 @@ class SignalPath:
         return ".".join([*names, *more])
 
     def beside(self) -> dict[int, str]:
-        """Return the field that decides each step's choice of element, by the step's index."""
+        """Return, for steps that select an element by text: step index -> field to compare."""
         names = {}
         for place, step in enumerate(self.steps):
             if step.choice is not None and isinstance(step.choice.which, str):
@@ -150,7 +150,7 @@ class SignalPath:
         return [*values, *self.beside().values()]
 
     def check(self, leaves: Sequence[Leaf], *ends: str) -> list[str]:
-        """Return the kinds (`float64`, `string`, …) of its values in messages with these fields.
+        """Return the types (`float64`, `string`, …) of the path's values; `leaves` are all fields.
 
         Raises:
             PathProblem: there is no such field, or it repeats and the path has no brackets for it,
@@ -185,7 +185,7 @@ class SignalPath:
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
     def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> PathValues:
-        """Return the values that the path selects in these columns (those of `wanted`)."""
+        """Return the values that the path selects; `columns` holds the fields of `wanted`."""
         names = self.beside()
         path = self.leaf() if end is None else f"{self.leaf(len(self.steps))}.{end}"
         column, beside = columns[path], {place: columns[name] for place, name in names.items()}
@@ -195,7 +195,7 @@ class SignalPath:
             if step.choice is None:
                 continue
             parent, position, column = _open(column)
-            # Fields inside the element are flattened with it; a `name[]` beside it is not.
+            # Of the fields to compare, those in the element are flattened too, not a `name[]`.
             inside = {p for p in beside if p > place or (p == place and step.choice.key)}
             for other in inside:
                 beside[other] = _open(beside[other])[2]
@@ -305,7 +305,7 @@ def _equals(values: NDArray[Any], text: str) -> NDArray[np.bool_]:
 
 
 def _first(rows: Rows, parent: Rows) -> Rows:
-    """Return the first element of each parent."""
+    """Keep the first of the elements `rows` of each parent; `parent` has all elements' parents."""
     return rows[np.unique(parent[rows], return_index=True)[1]]
 
 
@@ -334,8 +334,8 @@ class Convention:
     messages. It returns the values with NaN for those that were not measured.
     """
 
-    type: str  # last part of the type, as JSON and protobuf types have other package names
-    values: tuple[str, ...]  # fields that it applies to, with all fields below them
+    type: str  # message type without its package, which differs in JSON and protobuf
+    values: tuple[str, ...]  # fields that can be marked, including all fields below them
     marked_by: tuple[str, ...]  # fields that mark a value as not measured
     read: Callable[..., F64]
     words: str  # how a value is marked, for messages to the user
@@ -347,7 +347,7 @@ class Convention:
 
     @property
     def of_messages(self) -> bool:
-        """Return whether a message marks all of `values` at once, whatever they are."""
+        """Return whether messages mark all of `values` together, regardless of their numbers."""
         return self.read is _unless_minus_one or self.read is _unless_negative
 
     def flags(self, columns: Mapping[str, FieldColumn]) -> Bools:
@@ -367,7 +367,7 @@ def _unless_negative(values: F64, status: F64) -> F64:
 def _within(values: F64, low: F64, high: F64) -> F64:
     """Return the values, NaN outside the limits; -inf (too close, REP 117) becomes `low`."""
     near = np.where(np.isneginf(values), low, values)
-    given = (high > 0) & (low <= high)  # otherwise the driver publishes no limits
+    given = (high > 0) & (low <= high)  # where False, the driver does not fill its limits in
     return np.where(given & ~((near >= low) & (near <= high)), np.nan, near)
 
 
@@ -383,7 +383,7 @@ CONVENTIONS = (
     _unknown("Imu", "angular_velocity", "angular_velocity_covariance"),
     _unknown("Imu", "linear_acceleration", "linear_acceleration_covariance"),
     _unknown("Imu", "orientation", "orientation_covariance"),
-    # Drivers that measure only wheels, or only poses, mark the other half in the same way.
+    # Drivers that measure only speeds, or only poses, mark the unmeasured half in the same way.
     _unknown("Odometry", "twist.twist", "twist.covariance"),
     _unknown("Odometry", "pose.pose", "pose.covariance"),
     Convention(  # sensor_msgs/NavSatStatus: STATUS_NO_FIX
@@ -403,8 +403,8 @@ CONVENTIONS = (
         lambda values: values,
         "NaN",
     ),
-    # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". For
-    # the scans of inputs, `restock.ingest.task.surroundings` applies limits of its own.
+    # sensor_msgs/Range and LaserScan: "values < range_min or > range_max should be discarded". Not
+    # for scans in [inputs], to which `restock.ingest.task.surroundings` applies the task's limits.
     Convention(
         "Range", ("range",), ("min_range", "max_range"), _within, "outside min_range to max_range"
     ),
@@ -434,7 +434,7 @@ def conventions_of(kind: str, path: str, fields: Collection[str] | None = None) 
 
 
 def read_element(columns: Mapping[str, FieldColumn], path: str) -> F64:
-    """Return a field of each message, or an element of a list, (N,); NaN if the list is shorter."""
+    """Return one number per message, (N,): a field, or an element of a list (NaN if missing)."""
     path, place = element_of(path)
     column = columns[path]
     if place is None:
@@ -464,7 +464,7 @@ FIELDS = (
     *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
 )
 _FOXGLOVES = ("timestamp", "parent_frame_id", "child_frame_id", *AXES, *TURN)
-_LAYOUTS = (  # the same fields in three types: ROS's, foxglove.FrameTransforms, FrameTransform
+_LAYOUTS = (  # FIELDS in ROS's type, in foxglove.FrameTransforms and in foxglove.FrameTransform
     FIELDS,
     tuple(f"transforms[].{path}" for path in _FOXGLOVES),
     _FOXGLOVES,
@@ -474,7 +474,7 @@ FRAME_IDS = (FRAME_ID, "frame_id")  # in ROS messages, and in Foxglove's
 
 
 def frame_path(source: Input, fields: Container[str]) -> str | None:
-    """Return the field with the frame of an input's point: that of the innermost header."""
+    """Return the field that names the frame of an input's position, in the innermost header."""
     around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
     for count in range(len(around), -1, -1):
         path = ".".join([*around[:count], FRAME_ID])

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Clock(Checked, frozen=True):
-    """The `[clock]` of a profile: the time of messages, and the times of the steps."""
+    """The `[clock]` of a profile: which of a message's times counts, and when steps are taken."""
 
     alignment: Literal["header.stamp", "log_time"] = "header.stamp"
     steps: Literal["rate", "command"] = "rate"
@@ -55,7 +55,7 @@ class Episodes(Checked, frozen=True):
 
 
 class Frames(Checked, frozen=True):
-    """The `[frames]` of a profile: take poses of `base` in `fixed` from transforms."""
+    """The `[frames]` of a profile: take the pose of frame `base` in `fixed` from transforms."""
 
     fixed: str = "map"
     base: str = "base_link"
@@ -71,10 +71,10 @@ class Frames(Checked, frozen=True):
 class Motion(Checked, frozen=True):
     """The `[motion]` of a profile: speeds from poses, for robots without odometry."""
 
-    window_s: Annotated[float, Meta(gt=0, le=5)]  # length of the window of poses for a speed
+    window_s: Annotated[float, Meta(gt=0, le=5)]  # time span of the poses that a speed is fitted to
 
 
-class Zone(Checked, frozen=True, omit_defaults=True):  # a default is left out of the profile's hash
+class Zone(Checked, frozen=True, omit_defaults=True):  # keys at their default do not change a hash
     """A named rectangle of the map.
 
     `box_m = [x0, y0, x1, y1]` is turned about its middle by `yaw_rad`, counter-clockwise.
@@ -82,7 +82,7 @@ class Zone(Checked, frozen=True, omit_defaults=True):  # a default is left out o
 
     name: str
     box_m: tuple[float, float, float, float]
-    # None rather than 0, as msgspec recognises defaults by identity.
+    # None, not 0.0: msgspec omits a default only if the value is the same object.
     yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
 
     def check(self) -> None:
@@ -173,7 +173,7 @@ class CustomSignal(Checked, frozen=True):
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """Return the fields to read if the path ends at a message: those of a quaternion."""
+        """Return the fields to read below the path's end: those of a quaternion for "yaw"."""
         return QUATERNION if self.reduce == "yaw" else ()
 
     @property
@@ -270,12 +270,12 @@ SCAN_OF_CLOUD = {
     "angle_increment_rad": "angle_increment",
 }
 _Bearing = Annotated[float, Meta(ge=-3.1416, le=3.1416)]
-_OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of the outline
+_OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # coordinate in m from the middle of the outline
 SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # inputs of up to four lidars
 
 
 class Form(NamedTuple):
-    """The fields of messages that fill an input."""
+    """The names of fields that an input must or may have."""
 
     needs: tuple[str, ...] = ()
     either: tuple[str, ...] = ()  # exactly one of these two is required, too
@@ -359,7 +359,7 @@ class Input(Checked, frozen=True):
     topic: str
     type: str
     fields: dict[str, str]  # name in `INPUT_FIELDS` -> path in the message
-    # Largest age at the step; None: latched until the next message.
+    # Largest age of a message that a step uses; None: it holds until the next message.
     max_age_s: Annotated[float, Meta(gt=0)] | None = None
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
@@ -369,13 +369,13 @@ class Input(Checked, frozen=True):
     upside_down: bool = False
     lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
     lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
-    # For a point cloud: the slice, in its frame, read as a scan (`restock.ingest.steps.clouds`).
-    height_m: tuple[float, float] | None = None  # the lowest and highest point
-    angle_rad: tuple[_Bearing, _Bearing] | None = None  # the first and last bearing; None: all
+    # For a point cloud: the slice that `restock.ingest.steps.clouds` reads as a scan.
+    height_m: tuple[float, float] | None = None  # its lowest and highest height above the lidar
+    angle_rad: tuple[_Bearing, _Bearing] | None = None  # its first and last bearing; None: all
     # For a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
-    origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
-    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # fixes above are not used; None: 5
-    track_m: Annotated[float, Meta(gt=0)] | None = None  # distance that gives the yaw; None: 1
+    origin_deg: tuple[float, float] | None = None  # origin of the map; None: the first fix
+    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # less certain fixes are unused; None: 5
+    track_m: Annotated[float, Meta(gt=0)] | None = None  # way driven to find a yaw; None: 1
 
     @property
     def by_fix(self) -> bool:
@@ -384,7 +384,7 @@ class Input(Checked, frozen=True):
 
     @property
     def by_rates(self) -> bool:
-        """Return whether the input has speeds, which makes a pose one by dead reckoning."""
+        """Return whether the input has speeds; a pose with speeds is found by dead reckoning."""
         return not {*BY_RATES.needs, *BY_RATES.may}.isdisjoint(self.fields)
 
 
@@ -394,7 +394,7 @@ class Inputs(Checked, frozen=True):
     command: Input
     wheels: Input | None = None  # None: speeds from poses, by [motion]
     pose: Input | None = None
-    heading: Input | None = None  # for fixes; None: the direction of driving
+    heading: Input | None = None  # for a pose by fixes; None: the direction of driving
     scan: Input | None = None
     scan_2: Input | None = None  # further lidars; the nearest return of any of them counts
     scan_3: Input | None = None
@@ -422,7 +422,7 @@ class Inputs(Checked, frozen=True):
 
 
 def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
-    """Check an input's fields and settings; `framed` if the profile has [frames] to give the pose.
+    """Check an input's fields and settings; `framed` says whether [frames] can give the pose.
 
     Raises:
         ConfigError: a field or setting is missing or does not apply; names the key.
@@ -567,7 +567,7 @@ def _check_wheelbase(key: str, source: Input, where: str) -> None:
 
 
 def check_command_source(key: str, source: Input, command: Input, where: str) -> None:
-    """Check that a source of commands has the command's fields, or a button that shows it drives.
+    """Check that a source of commands has commands, or a button that is pressed while it drives.
 
     Raises:
         ConfigError: it does not; names the key.

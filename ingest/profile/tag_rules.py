@@ -22,9 +22,9 @@ import msgspec
 from restock.errors import ConfigError, RecordingError
 from restock.toml import Checked
 
-NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
+NAMED = ("robot", "site", "firmware", "map", "shift")  # tags that are columns of the views
 MAX_TAGS = 64  # per recording
-MAX_NAME, MAX_VALUE = 64, 256  # characters
+MAX_NAME, MAX_VALUE = 64, 256  # longest name and value of a tag, in characters
 
 
 def parse_tags(texts: Iterable[str], *, empty: bool = False) -> dict[str, str]:
@@ -81,7 +81,7 @@ def in_words(tags: Mapping[str, str]) -> str:
     return ", ".join(f"{name}={tags[name]}" for name in names)
 
 
-# Metadata of a recording: the source's name for messages, the record's name, and its entries.
+# One record of a recording's metadata: what errors call its source, its own name, its entries.
 Metadata: TypeAlias = "tuple[str, str, Mapping[str, str]]"
 _TAGS_TABLE = "`[tags]` of the profile"
 
@@ -89,9 +89,9 @@ _TAGS_TABLE = "`[tags]` of the profile"
 class TagRules(Checked, frozen=True):
     """The `[tags]` of a profile: how to read tags from a recording's path and metadata.
 
-    `from_path` is a pattern for the last parts of the path, or several, of which the first match
-    counts. `{robot}` matches the value of a tag, `*` anything within a part, `?` one character and
-    `**` any number of parts. `from_metadata` maps a tag to an entry of the recording's metadata:
+    `from_path` is a pattern for the end of the path, or a list of patterns, of which the first that
+    matches is used. `{robot}` matches that tag's value, `*` any part of a name, `?` one character
+    and `**` any number of folders. `from_metadata` maps a tag to an entry of the metadata:
     `robot = "vehicle_id"`, or `"record.vehicle_id"` if several records have that entry.
     """
 
@@ -110,7 +110,7 @@ class TagRules(Checked, frozen=True):
         return [self.from_path] if isinstance(self.from_path, str) else self.from_path
 
     def of_path(self, path: Path, given: Collection[str]) -> dict[str, dict[str, str]]:
-        """Return the tags of a path, keyed by their source; empty without a pattern.
+        """Return the tags in a path, under the name of their source; {} if there is no pattern.
 
         Raises:
             RecordingError: no pattern matches, and `given` lacks some tag of the patterns.
@@ -137,12 +137,12 @@ class TagRules(Checked, frozen=True):
     def of_metadata(
         self, metadata: Sequence[Metadata], given: Collection[str], where: str
     ) -> tuple[dict[str, dict[str, str]], list[str]]:
-        """Return the tags in a recording's metadata, keyed by their source, and notes.
+        """Return the tags in a recording's metadata by the name of their source, and user notes.
 
         Raises:
             RecordingError: the metadata has two values of a tag that is not `given`.
         """
-        found: dict[str, list[tuple[str, str, str]]] = {}  # value, source, record
+        found: dict[str, list[tuple[str, str, str]]] = {}  # of each tag: value, source, record
         for source, record, entries in metadata:
             for key, value in entries.items():
                 for name in self._names(record, key):
@@ -155,7 +155,7 @@ class TagRules(Checked, frozen=True):
         for name in dict.fromkeys([*named, *found]):
             value, source, _ = found[name][0]
             other = next((entry for entry in found[name] if entry[0] != value), None)
-            # Two records may use a name that no rule mentions for different things.
+            # A name that no rule mentions may have different meanings in two records.
             same = name in named or not any(record for _, _, record in found[name])
             if other and same:
                 raise _contradiction(name, (value, source), other[:2], where)
@@ -174,7 +174,7 @@ class TagRules(Checked, frozen=True):
         ]
 
     def _names(self, record: str, key: str) -> list[str]:
-        """Return the names of the tags that take their value from an entry of the metadata."""
+        """Return the names of the tags that take their value from the entry `key` of a record."""
         wanted = (key, f"{record}.{key}")
         requested = [name for name, source in self.from_metadata.items() if source in wanted]
         return requested or [key] * (key not in self.from_metadata)
