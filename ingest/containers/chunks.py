@@ -32,7 +32,7 @@ def _fastest_crc32() -> Callable[..., int]:
     return fast
 
 
-crc32 = _fastest_crc32()  # (data, CRC of the data before it = 0)
+crc32 = _fastest_crc32()  # arguments: data, and the CRC of the data before it (default: 0)
 
 
 class FileBytes:
@@ -41,7 +41,7 @@ class FileBytes:
     It is not mapped into memory: if a mapped file shrinks, reading it kills the process.
     """
 
-    WINDOW = 16 << 10  # bytes that a small read reads at once, as fields are read one by one
+    WINDOW = 16 << 10  # bytes read at least, as callers read field by field
     PIECE = 8 << 20  # bytes searched or checked at a time
 
     def __init__(self, path: Path) -> None:
@@ -58,7 +58,7 @@ class FileBytes:
     @overload
     def __getitem__(self, key: slice) -> bytes: ...
     def __getitem__(self, key: int | slice) -> int | bytes:
-        """Return a byte or a slice, as bytes do.
+        """Return the byte at an index, or the bytes of a slice, as `bytes` does.
 
         Raises:
             RecordingError: the file is shorter than it was when it was opened.
@@ -121,7 +121,7 @@ class FileBytes:
         self._file.close()
 
 
-# The file claims a chunk's uncompressed size: a larger claim is refused, and nothing is allocated.
+# Limit of the uncompressed size that a chunk may claim, checked before memory is allocated.
 MAX_CHUNK = 4 << 30
 STEP = 1 << 12  # bytes of damaged data decompressed at a time: only data near the damage is lost
 
@@ -175,7 +175,7 @@ def inflate(chunk: StoredChunk, stored: bytes) -> bytes:
 
 
 def inflate_into(chunk: StoredChunk, stored: bytes, room: NDArray[np.uint8]) -> None:
-    """Decompress a chunk into `room`, which has its size, as reusing memory costs less.
+    """Decompress a chunk into memory of its size, `room`: reusing that is faster than allocating.
 
     Raises:
         BadChunk: as `inflate`.
@@ -204,7 +204,7 @@ def _check(chunk: StoredChunk, data: bytes | memoryview) -> None:
 
 
 def inflate_partly(chunk: StoredChunk, file: Buffer) -> bytes:
-    """Return a chunk's first records, unchecked, up to the damage."""
+    """Return a damaged chunk's records up to the damage, without a check of their CRC."""
     limit = min(MAX_CHUNK, chunk.size, max_plausible_bytes(chunk.stop - chunk.start))
     if chunk.compression == "":
         return file[chunk.start : min(chunk.start + limit, chunk.stop)]

@@ -44,9 +44,9 @@ from restock.ingest.containers.storage import (
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 VERSION = "v3.0"
-GAP_S = 10  # between episodes: longer than a profile allows within one
-MAX_S, MAX_WIDTH = 1e6, 4096  # limits of a timestamp, and of the numbers in a feature
-ROWS, IMAGES = 65_536, 256  # frames read at a time
+GAP_S = 10  # pause put between episodes: longer than a profile allows within one
+MAX_S, MAX_WIDTH = 1e6, 4096  # largest timestamp in seconds; most numbers in a feature
+ROWS, IMAGES = 65_536, 256  # frames read at a time, without and with images
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FRAME, IMAGE = "/frame", "sensor_msgs/msg/CompressedImage"
 CDR = b"\x00\x01\x00\x00"
@@ -56,7 +56,7 @@ _NUMERIC = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 class _Feature(NamedTuple):
     name: str
-    fields: tuple[str, ...]  # of its messages; empty for images
+    fields: tuple[str, ...]  # names of its messages' fields; empty for images
 
 
 class _Frames(NamedTuple):
@@ -212,7 +212,7 @@ class LeRobotFolder(Storage):
     def _batch(
         self, number: int, part: pa.RecordBatch, stamp_ns: Ints, short: Counter[tuple[int, str]]
     ) -> MessageBatch:
-        """Build the messages of a channel for these frames; count frames without one in `short`."""
+        """Build a channel's messages from these frames; count frames that give none in `short`."""
         if number == 1:
             counters = [
                 part[name].cast(pa.int64()).to_numpy(zero_copy_only=False) for name in COUNTERS
@@ -277,7 +277,7 @@ def log_times(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[
     """Return a log time for each frame (N,), and the first frame out of order with the reason.
 
     Within an episode, log times follow its timestamps. Each episode begins GAP_S after the end of
-    the one before, and so do the frames from one that is out of order on.
+    the one before. A frame that is out of order is treated as the start of an episode.
     """
     if not len(episode):
         return np.zeros(0, np.int64), None
@@ -299,7 +299,7 @@ def log_times(episode: Ints, seconds: NDArray[np.float64]) -> tuple[Ints, tuple[
 
 
 def fixed_width_rows(column: pa.Array, width: int) -> tuple[Bools, NDArray[np.float64]]:
-    """Return which of N rows have `width` values, and those values, (M, width); null is NaN."""
+    """Return which rows have `width` values, (N,), and their values, (M, width), null as NaN."""
     good = np.ones(len(column), np.bool_)
     if hasattr(column.type, "value_type"):
         good = np.asarray(pc.fill_null(pc.equal(pc.list_value_length(column), width), False))

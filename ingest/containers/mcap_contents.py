@@ -37,10 +37,10 @@ from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entri
 MAX_CHUNKS = 1_000_000
 MAX_NAMED = 10_000  # attachments and metadata records; further ones are only counted
 MAX_DAMAGED = 100
-FOOTER_BYTES = 20  # of its content; the last 4 are the CRC from the summary's start up to them
+FOOTER_BYTES = 20  # size of its content; the last 4: CRC of all from the summary's start to there
 TELL_EVERY = 65_536  # records between two calls of `watch`
 ROSBAG2 = "rosbag2"  # name of the metadata record of rosbag2's storage
-MAX_OTHERS = 1_000_000  # records of kinds other than `_MANY`
+MAX_OTHERS = 1_000_000  # records whose kind is not in `_MANY`
 _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
 
@@ -53,7 +53,7 @@ class Statistics(NamedTuple):
 
 @dataclass
 class Contents:
-    """The result of the walk over a file."""
+    """The contents of an MCAP file, as found by a walk over its top-level records."""
 
     profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
@@ -62,9 +62,9 @@ class Contents:
     copies: Definitions = field(default_factory=Definitions)  # repeated in the summary
     summary_proven: bool = False  # its CRC matches
     statistics: Statistics | None = None
-    data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
+    data_end: tuple[int, int] = (0, 0)  # where the data section ends, and its CRC (0: unchecked)
     cut: Malformed | None = None  # where and why the walk ended early
-    cut_chunk: Chunk | None = None  # the chunk at the cut, up to where the file has it
+    cut_chunk: Chunk | None = None  # the chunk at the cut, as far as the file has it
     resumed: bool = False  # whether reading went on beyond the cut, up to an intact summary
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
     extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
@@ -95,7 +95,7 @@ class Contents:
 
 
 def survey(file: FileBytes, watch: Watch = no_progress, *, only: Collection[int] = ()) -> Contents:
-    """Walk the top-level records and take in all kinds, or `only` some; report to `watch`."""
+    """Read the top-level records, or those with opcodes in `only`; report to `watch`."""
     contents = Contents()
     end = len(file)
     finished = False
@@ -122,7 +122,7 @@ def survey(file: FileBytes, watch: Watch = no_progress, *, only: Collection[int]
     if not finished and contents.cut is None:
         contents.cut = Malformed("its footer is missing", end)
     if contents.cut is not None:
-        if contents.chunks:  # the last whole chunk's index may be cut off
+        if contents.chunks:  # the last whole chunk's index may be incomplete: drop it
             contents.chunks[-1] = replace(contents.chunks[-1], index={})
         contents.cut_chunk = cut_chunk_at(file, contents.cut.at, end)
     return contents
@@ -198,8 +198,8 @@ def _add_extra(contents: Contents, extra: Extra) -> None:
 def _add_metadata(contents: Contents, file: str, name: str, record: dict[str, str]) -> None:
     """Keep the entries of a metadata record.
 
-    rosbag2 writes its metadata.yaml into one when it opens the file and again when it closes it:
-    the last one is kept.
+    rosbag2 writes its metadata.yaml into such a record when it opens a file, and into another one
+    when it closes the file: the last one is kept.
     """
     if name == ROSBAG2:
         contents.rosbag2 = record.get("serialized_metadata", "")
@@ -307,7 +307,7 @@ def _read_summary(file: FileBytes) -> _Summary | None:
 
 
 def _resume_by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
-    """Use the chunks of the chunk index whose records agree with it; return the losses."""
+    """Take the chunks whose records agree with the summary's chunk index; return the losses."""
     lost = []
     chunks = []
     for record in summary.indexed:
@@ -326,7 +326,7 @@ def _resume_by_index(file: FileBytes, contents: Contents, summary: _Summary, cut
     for opcode, start, stop in summary.definitions:
         contents.copies.take(opcode, file, start, stop)
     contents.statistics, contents.summary_proven = summary.statistics, summary.proven
-    # Drop what the walk took for messages outside chunks, but is in the damage or in a chunk.
+    # Drop messages that the walk found outside chunks, but that lie in the damage or in a chunk.
     contents.loose = {
         channel: whole
         for channel, places in contents.loose.items()
@@ -347,7 +347,7 @@ def _resume_by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
     for at in _find_chunks(file, cut + 1):
         if at < cut:
             continue  # already walked
-        if contents.cut_chunk is not None:  # it ends at the latest where the next one begins
+        if contents.cut_chunk is not None:  # the cut chunk cannot reach beyond `at`
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
         lost.append(f"{_describe_loss(contents, cut, at)}: reading continues at the next chunk")
         if contents.cut_chunk is not None:

@@ -78,7 +78,7 @@ class ChunkReader:
     def read(
         self, groups: Iterable[list[Chunk]], wanted: set[int]
     ) -> Iterator[tuple[int, MessageBatch]]:
-        """Yield the messages of channels, group by group; each batch is valid until the next."""
+        """Yield `wanted` channels' messages, group by group; each batch is valid until the next."""
         for group in groups:
             buffer, parts = self._inflate_group(group)
             whole = self._find_by_index(parts, buffer, wanted)
@@ -87,7 +87,7 @@ class ChunkReader:
             )
             for channel in sorted(set().union(*located)):
                 yield channel, join_parts(buffer, [at[channel] for at in located if channel in at])
-        self._scratch = np.zeros(0, np.uint8)  # free it: the file stays open while rows are made
+        self._scratch = np.zeros(0, np.uint8)  # free this memory: the file stays open
 
     def _find_by_index(
         self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
@@ -243,7 +243,7 @@ class McapFile(Storage):
         counts = contents.indexed_counts()
         if claimed is not None:
             if any(count > counts[number] for number, count in claimed.items()):
-                contents.distrust_index()  # the index leaves messages out: walk
+                contents.distrust_index()  # the index leaves messages out, so walk the chunks
                 return claimed
             more = {number for number, count in counts.items() if count > claimed.get(number, 0)}
             if more:
@@ -272,7 +272,7 @@ class McapFile(Storage):
                 break
             without_them = at and chunk.index and not lacking & chunk.index.keys()
             if without_them and not copies.lacking(lacking):
-                continue  # the lacking channels begin in a later chunk
+                continue  # the chunk has no message of the channels that are still to be defined
             records = self._chunks.inflate(chunk)
             known = mcap_records.definitions_in(records).overridden_by(known)
         if not contents.summary_proven:
@@ -392,7 +392,7 @@ def metadata_of(path: Path) -> list[Metadata] | None:
 
 
 def _metadata(contents: Contents, path: Path, notes: list[str]) -> list[Metadata]:
-    """Return the entries of the metadata records and of rosbag2's; add problems to `notes`."""
+    """Return metadata records' entries and rosbag2's custom_data; add problems to `notes`."""
     kept, left_out = contents.metadata, contents.left_out
     try:
         custom, more = custom_data(contents.rosbag2, path.name, kept)

@@ -21,12 +21,12 @@ from restock.ingest.containers.chunks import Buffer, StoredChunk
 from restock.ingest.decoding.columns import Channel, gather
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_KEPT = 64 << 10  # bytes of a definition that is cached for other files
+MAX_KEPT = 64 << 10  # largest definition, in bytes, that is cached for other files
 PREFIX = 9  # bytes before a record's content: opcode (1), length of the content (8)
 
 
 class Malformed(Exception):
-    """A record that is cut short or not a record. `at` is its position in the buffer."""
+    """Bytes that are a cut-short record or none at all. `at` is their position in the buffer."""
 
     def __init__(self, what: str, at: int) -> None:
         super().__init__(what)
@@ -53,8 +53,8 @@ class Op(IntEnum):
     DATA_END = 0x0F
 
 
-# Name and kind of each field. "span32", "span64" and "rest" give (start, stop) in the buffer, not
-# copies.
+# Name and kind of each field. Fields of the kinds "span32", "span64" and "rest" are not copied:
+# their value is the position (start, stop) in the buffer.
 FIELDS: dict[Op, tuple[tuple[str, str], ...]] = {
     Op.HEADER: (("profile", "text"), ("library", "text")),
     Op.FOOTER: (("summary_start", "Q"), ("summary_offset_start", "Q"), ("summary_crc", "I")),
@@ -290,7 +290,7 @@ def indexed_messages(
     room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
     if (offset > room).any() or (size < HEAD_SIZE).any():
         return None
-    # File order: entries are sorted by time. Chunks stay in order, so `base` and `size` still fit.
+    # From order of time to file order. No entry leaves its chunk, so `base` and `size` still fit.
     at = np.sort(offset.astype(np.int64) + base)
     head = gather(buffer, at, _HEAD)
     length = head["length"]
@@ -315,7 +315,7 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
     """Walk an uncompressed chunk; return positions of message records, and where it is cut."""
     places: list[int] = []
     note = places.append
-    length_at = struct.Struct("<xQ").unpack_from  # after the opcode
+    length_at = struct.Struct("<xQ").unpack_from  # the length field, after the opcode
     position, end = 0, len(part)
     last = end - (PREFIX + 2)
     while position <= last and part[position]:  # no record has opcode 0
@@ -340,7 +340,7 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
 
 
 def messages_at(buffer: NDArray[np.uint8], at: Ints) -> Messages:
-    """Return the messages whose records start at these (walked) positions."""
+    """Return the messages whose records start at these positions, which a walk found."""
     return _messages(at, gather(buffer, at, _HEAD))
 
 
@@ -407,7 +407,7 @@ class Definitions:
         }
 
     def differing(self, other: Definitions) -> list[str]:
-        """Return the names of schemas and channels that both define, but differently."""
+        """Return schemas and channels that `other` defines differently, such as "schema 3"."""
         schemas = self.schemas.keys() & other.schemas.keys()
         channels = self.channels.keys() & other.channels.keys()
         return [
@@ -416,7 +416,7 @@ class Definitions:
         ]
 
     def named(self) -> dict[int, Channel]:
-        """Return every channel with its schema; without one, its messages have no type."""
+        """Return every channel, described with its schema; a channel without one has no type."""
         return {
             number: Channel(
                 number,

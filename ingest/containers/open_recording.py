@@ -45,7 +45,7 @@ from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitio
 
 
 def _open_lerobot(path: Path, *, salvage: bool, watch: Watch) -> Storage:
-    from restock.ingest.containers.lerobot_folder import LeRobotFolder  # imports PyArrow
+    from restock.ingest.containers.lerobot_folder import LeRobotFolder  # loads PyArrow, slow
 
     return LeRobotFolder(path, salvage=salvage, watch=watch)
 
@@ -91,13 +91,13 @@ LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, readable by root alone
 MAX_METADATA = 2 << 20  # bytes; real files have some kB, and the parser is slow
-FOLDER_HEAD_BYTES = 1 << 20  # of the file by which a container recognises a folder
-_PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # a file of a split bag; longer numbers are dates
+FOLDER_HEAD_BYTES = 1 << 20  # bytes read of the file by which a container recognises a folder
+_PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # name of a bag's part; longer numbers are dates
 _NAMES = (
     f"recordings end in {', '.join(name for one in CONTAINERS for name in one.endings)}"
     " or are folders of rosbag2 or LeRobot"
 )
-# Most of the text, and not needed here: the profiles of every publisher. The parser is slow.
+# The publishers' QoS profiles: most of metadata.yaml, not needed here, and slow to parse.
 _QOS = re.compile(r"(?m)^( +)offered_qos_profiles:[ \t]*\n(?:\1[ -].*\n)+")
 _ZSTD = re.compile(r"\.zstd?$")
 
@@ -128,7 +128,7 @@ def recordings_in(path: Path | str) -> list[Path]:
     path = recording_path(path)
     try:
         return _find_recordings(path)
-    except OSError as error:  # of this folder; an unreadable subfolder is listed as a recording
+    except OSError as error:  # `path` itself is unreadable; such subfolders would be listed
         raise cannot_be_read(error, path) from error
 
 
@@ -195,7 +195,7 @@ def _in_folder(folder: Path) -> list[Path]:
             continue
         if item.is_dir():
             recordings += [] if item.is_symlink() else _search_folder(item)
-        elif is_storage_name(item):  # also a broken link or a pipe
+        elif is_storage_name(item):  # by name only: also a broken link or a pipe
             recordings.append(item)
     return recordings
 
@@ -213,7 +213,7 @@ def is_storage_name(path: Path) -> bool:
 
 
 def is_bag(folder: Path) -> bool:
-    """Return whether a folder is a bag: it has metadata.yaml, or only storage files of its name."""
+    """Return whether a folder is a bag: with metadata.yaml or only storage files named after it."""
     if (folder / METADATA).is_file():
         return True
     files = [item for item in folder.iterdir() if item.is_file() and is_storage_name(item)]
@@ -234,7 +234,7 @@ class ClaimedTopic:
 class BagMetadata:
     """The contents of a bag's metadata.yaml, which are not trusted."""
 
-    files: tuple[str, ...] = ()  # without folders: only files in the bag's own folder are read
+    files: tuple[str, ...] = ()  # names without folders: all are looked for in the bag's folder
     topics: tuple[ClaimedTopic, ...] = ()
     custom_data: Metadata | None = None
 
@@ -257,7 +257,7 @@ def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str
         elif match not in order:
             order.append(match)
     rest = sorted(storages.keys() - set(order), key=_natural_key)
-    files: dict[str, Path] = {}  # by name without the ending of compression
+    files: dict[str, Path] = {}  # file name without .zstd or .zst -> file
     copies = []
     for name in (*order, *rest):
         file, stem = present[name], _ZSTD.sub("", name)
@@ -442,7 +442,7 @@ def open_recording(
             cut short (unless `salvage`), or is a ROS 2 bag that is not serialised as CDR.
     """
     path = recording_path(path)
-    distro = choose_definitions(definitions)  # before anything is opened
+    distro = choose_definitions(definitions)  # may raise, so before a file is opened
     return _Opening(path, distro, salvage, watch or no_progress).open()
 
 
@@ -466,7 +466,7 @@ class _Opening:
         self.storages: list[Storage] = []
         self.containers: list[Container] = []
         self.damage: list[Damage] = []
-        self.missing: list[str] = []  # files that metadata.yaml lists, but are not there
+        self.missing: list[str] = []  # files that metadata.yaml lists but that do not exist
         self.notes: list[str] = []
         self.cleanup: list[Callable[[], None]] = []
 
@@ -613,8 +613,8 @@ class _Opening:
     def _compare(self, metadata: BagMetadata, files: list[Path]) -> None:
         """Compare metadata.yaml with the files.
 
-        Messages that it counts but the files lack are lost; messages that it does not count are
-        noted. A missing file that it lists is only noted if every counted message is there.
+        Counted messages that the files lack are lost; messages beyond the count are noted. A file
+        that is listed but missing is only noted if the others have every counted message.
         """
         counts = Counter[str]()
         for storage in self.storages:
@@ -630,12 +630,12 @@ class _Opening:
                 self.damage.append(Damage(what))
         in_files = [sum(storage.counts.values()) for storage in self.storages]
         for file, count, later in zip(files, in_files, range(1, len(in_files) + 1), strict=True):
-            if not count and any(in_files[later:]) and not whole:  # rosbag2 starts none
+            if not count and any(in_files[later:]) and not whole:  # rosbag2 starts no empty file
                 self.damage.append(Damage(f"{file.name} holds no message"))
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue
-            name = visible(topic.name)  # like the topic names in the files
+            name = visible(topic.name)  # as names are written in `counts`
             counted = counts[name]
             if counted == topic.messages:
                 continue

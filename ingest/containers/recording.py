@@ -44,7 +44,7 @@ from restock.ingest.decoding.columns import (
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.row_by_row import Decoder
 
-MAX_DEFINED_BYTES = 8 << 20  # of message definitions: parsing takes about a second per MB
+MAX_DEFINED_BYTES = 8 << 20  # limit of all message definitions: parsing takes about 1 s per MB
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Recording:
         self._streams: dict[str, list[_Stream]] = {}
         # (storage index, channel id) -> type of its messages, or why they cannot be decoded
         self._types: dict[tuple[int, int], MessageType | CannotDecode] = {}
-        self._defined: dict[tuple[str, str, int], int] = {}  # definition -> its bytes
+        self._defined: dict[tuple[str, str, int], int] = {}  # type, format, hash -> bytes
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
@@ -170,7 +170,7 @@ class Recording:
             try:
                 self._bound_definitions(stream.channel)
                 self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
-            except CannotDecode as reason:  # kept, as parsing takes time
+            except CannotDecode as reason:  # stored, as parsing again takes time
                 self._types[key] = reason
         kind = self._types[key]
         if isinstance(kind, CannotDecode):

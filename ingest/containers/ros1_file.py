@@ -33,11 +33,11 @@ from restock.ingest.decoding.columns import Channel, MessageBatch
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER = 64 << 10  # bytes of a record's header
-INDEX_ENTRY = 12  # bytes
-# Limit of decompressed bz2 chunks in memory: proposing a profile reads topic by topic; bz2 is slow.
+INDEX_ENTRY = 12  # bytes per message in a chunk's index
+# Limit in bytes of decompressed chunks kept: bz2 is slow, and proposals read topic by topic.
 KEPT_BYTES = 128 << 20
-# Limit of messages whose positions are kept, 24 bytes each: walking a chunk takes longer than
-# decompressing it.
+# Number of messages whose positions are kept, 24 bytes each, so that their chunks are walked only
+# once: a walk takes longer than decompression.
 MAX_REMEMBERED = 1 << 20
 
 _KNOWN = frozenset(map(int, RecordType))
@@ -49,7 +49,7 @@ class Walked(NamedTuple):
 
     places: dict[int, Ints]  # connection -> start, stop and log time of its messages, (N, 3)
     cut: int | None  # offset of the damage
-    connections: dict[int, tuple[Fields, Fields]]  # the ones defined in it
+    connections: dict[int, tuple[Fields, Fields]]  # id -> header's fields, data's fields
 
 
 def records(buffer: Buffer, start: int) -> Iterator[tuple[int, Fields, int, int]]:
@@ -123,11 +123,11 @@ class Ros1File(Storage):
         super().__init__()
         self._file = FileBytes(path)
         self._chunks: dict[int, StoredChunk] = {}  # by position in the file
-        # Chunk -> number of messages per connection: by the end of the file, by each chunk's index.
+        # Chunk -> messages per connection: as claimed by the bag's index, and by the chunk's index.
         self._claimed: dict[int, Counter[int]] = {}
         self._indexed: dict[int, Counter[int]] = {}
         self._spans = list[tuple[int, int]]()
-        self._index_at, self._expected = 0, (0, 0)  # position of the end; its connections, chunks
+        self._index_at, self._expected = 0, (0, 0)  # index position; number of connections, chunks
         self._connections: dict[int, tuple[Fields, Fields]] = {}
         self._walks: dict[int, Walked] = {}
         self._room = MAX_REMEMBERED
@@ -175,7 +175,7 @@ class Ros1File(Storage):
         if file[: len(MAGIC)] != MAGIC:
             return "it is not of format 2.0"
         cut = stop = self._take_records(len(MAGIC), watch)
-        if stop < self._index_at < end:  # the end of the file lists the other chunks
+        if stop < self._index_at < end:  # damaged, but the index at the end lists all chunks
             stop = self._take_records(self._index_at, watch)
             for at in sorted(one for one in self._claimed if cut <= one < self._index_at):
                 place, fields, data, after = next(records(file, at), (at, Fields(), end, end))
@@ -191,7 +191,7 @@ class Ros1File(Storage):
         return None if whole else "no index, or not all of it"
 
     def _take_records(self, start: int, watch: Watch) -> int:
-        """Take in the records from `start` on; return where they end, by damage or at the end."""
+        """Process records from `start` on; return where they stop, at damage or the file's end."""
         stop, chunk = start, -1
         for at, fields, data, after in records(self._file, start):
             watch("looking through the file, bytes", at, len(self._file))

@@ -35,10 +35,10 @@ MAX_MESSAGE = 256 << 20
 MAX_METADATA = 2 << 20  # characters
 MAX_QOS = 8192  # characters of a topic's offered profiles
 MAX_FOUND = 10  # problems that SQLite's check lists: one is enough to refuse the file
-STEPS_PER_BYTE = 64  # limit for SQLite's virtual machine; reading short rows takes one or two
+STEPS_PER_BYTE = 64  # steps allowed to SQLite's virtual machine; reading short rows takes 1 or 2
 MIN_STEPS = 10_000_000
 STEPS_AT_ONCE = 100_000
-# Findings of the check that are about values, not pages: such values are read as they are.
+# Problems of values, not of pages, in SQLite's check; ignored, as values are read as they are.
 _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
 
 _Pending = dict[int, tuple[list[bytes], list[int]]]  # topic id -> payloads, log times
@@ -129,7 +129,7 @@ class SqliteFile(Storage):
 
         It takes about as long as reading all rows.
         """
-        self._connection.execute("PRAGMA ignore_check_constraints = ON")  # they are programs
+        self._connection.execute("PRAGMA ignore_check_constraints = ON")  # their SQL is untrusted
         try:
             found = self._connection.execute(f"PRAGMA quick_check({MAX_FOUND})").fetchall()
         except sqlite3.DatabaseError as error:
@@ -309,8 +309,8 @@ def _batches(pending: _Pending) -> Iterator[tuple[int, MessageBatch]]:
 def guard(connection: sqlite3.Connection, size: int) -> None:
     """Limit the work of queries on a file of `size` bytes.
 
-    All queries of the connection together get more steps than a file of that size can need. Beyond
-    those, a query is interrupted, which raises sqlite3.OperationalError, as damage does.
+    All queries of the connection share a number of steps, more than an intact file of that size
+    needs. Beyond them, a query raises sqlite3.OperationalError, as it does for damage.
     """
     connection.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
     # No value in a file is longer than the file.
@@ -340,7 +340,7 @@ def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> 
             words = str(sql).upper().split()[:2]
             if kind != "table" or words != ["CREATE", "TABLE"]:
                 raise sqlite3.DatabaseError(f"{table} is not a plain table")
-        # A statement, as the function in FROM is not allowed in a schema that is not trusted.
+        # The PRAGMA statement: its form `FROM pragma_table_xinfo(…)` fails with trusted_schema OFF.
         if any(row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")):
             raise sqlite3.DatabaseError(f"{table} has computed columns")
 

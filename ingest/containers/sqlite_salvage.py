@@ -24,9 +24,9 @@ from restock.errors import RecordingError
 from restock.ingest.containers.storage import Damage, Storage
 from restock.ingest.decoding.columns import Channel, MessageBatch, PendingBatch
 
-LEAF, INTERIOR = 0x0D, 0x05  # of a table
-MIN_CELL = 4  # bytes
-INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # by serial type
+LEAF, INTERIOR = 0x0D, 0x05  # first byte of a table's pages, by their kind
+MIN_CELL = 4  # bytes of the shortest row
+INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # serial type -> bytes of an integer
 
 
 class Cell(NamedTuple):
@@ -35,7 +35,7 @@ class Cell(NamedTuple):
     rowid: int
     types: tuple[int, ...]  # serial types of the columns
     body: int  # offset of the columns in the payload
-    size: int  # of the whole payload
+    size: int  # bytes of the whole payload
     local: bytes  # the part of the payload in this page
     overflow: int  # the page with the next part; 0: none
 
@@ -46,7 +46,7 @@ class NotAPage(Exception):
 
 @dataclass(frozen=True)
 class Moves:
-    """How far pages moved: what the file calls page `named` is at `named + by`, in page order."""
+    """How far pages moved: the file's page `named[i]` (ascending) is at `named[i] + by[i]`."""
 
     named: Ints
     by: Ints
@@ -162,8 +162,8 @@ def children(page: bytes) -> list[tuple[int, int]]:
 def find_moves(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
     """Find how far pages moved, from the leaves (last row number, page) and interior pages.
 
-    Only interior pages right above leaves are used: each of their row numbers is the last one of
-    the leaf that goes with it.
+    Only interior pages right above leaves are used: they give each leaf's page number with its
+    last row number, by which the leaf is recognised.
     """
     leaves = sorted(leaves)
     place = {last: (order, page) for order, (last, page) in enumerate(leaves)}
@@ -265,7 +265,7 @@ class SalvagedSqliteFile(Storage):
         super().__init__()
         self.path, self._copy = path, copy  # a private copy includes the rows of a `-wal` file
         self.damaged(what)
-        # One entry for all passes: each finds the same losses again, for its own topics.
+        # One entry for all calls of `batches`, as each finds the losses of its topics again.
         self._unread = Damage("their pages are missing, damaged or too many")
         self._pages = Pages(Path(copy.name) / path.name if copy else path)
         self._taken = np.zeros(self._pages.count + 2, np.bool_)
@@ -286,7 +286,7 @@ class SalvagedSqliteFile(Storage):
         self.span_ns = (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
     def _survey(self) -> Ints:
-        """Return row number, topic id, log time, page and index in the page of messages, (N, 5)."""
+        """Return messages' row number, topic id, log time, page and index in the page, (N, 5)."""
         pieces, rows = [np.zeros((0, 5), np.int64)], list[tuple[int, int, int, int, int]]()
         leaves, interiors = list[tuple[int, int]](), list[list[tuple[int, int]]]()
         for number, kind, page in self._pages.tables():

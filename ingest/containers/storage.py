@@ -43,7 +43,7 @@ MAX_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
 HEAD_BYTES = 64  # first bytes of a file, by which a container recognises it
 LEROBOT_INFO, LEROBOT_DATA = "meta/info.json", "data/*/*.parquet"
 NOT_KEPT = f"not text, longer than {MAX_TEXT:,} characters, or beyond entry {MAX_ENTRIES:,}"
-# The key and its block. The key is indented by two spaces in metadata.yaml, not in storage files.
+# The key `custom_data` and its block. Only metadata.yaml indents the key, by two spaces.
 _CUSTOM_DATA = re.compile(
     r"^(?P<indent> {0,4})custom_data:(?P<value>.*)(?P<block>(?:\n(?:(?P=indent) .*|[ \t]*$))*)",
     re.MULTILINE,
@@ -90,7 +90,7 @@ class Metadata(NamedTuple):
 def keep_entries(
     record: Mapping[str, str], kept: Collection[Metadata] = ()
 ) -> tuple[dict[str, str], int]:
-    """Return the entries within the limits, `kept` ones included, and the number left out."""
+    """Return the record's entries that fit the limits next to `kept`, and how many do not."""
     room = MAX_ENTRIES - sum(len(item.entries) for item in kept)
     short = {n: v for n, v in record.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
     entries = dict(list(short.items())[: max(room, 0)])
@@ -100,8 +100,8 @@ def keep_entries(
 def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tuple[Metadata, int]:
     """Read rosbag2's `custom_data` from the text of a bag's metadata; `source` names its file.
 
-    Also returns the number of entries left out: those that are not text or exceed the limits, which
-    include the `kept` ones.
+    Also returns the number of entries left out: those that are not text, and those beyond the
+    limits, which hold for `kept` and the new entries together.
 
     Raises:
         ValueError: it is too long, or not valid YAML.
@@ -181,7 +181,7 @@ class Storage(ABC):
         return "damaged" if self.damage else "unverified"
 
     def damaged(self, what: str, messages: Mapping[int, int] | None = None) -> None:
-        """Record damage, once, with the number of messages lost by channel id."""
+        """Record damage unless it is recorded already; `messages`: lost ones by channel id."""
         if all(item.what != what for item in self.damage):
             self.damage.append(Damage(what, dict(messages or {})))
 
@@ -208,9 +208,9 @@ class Container:
     endings: tuple[str, ...]  # of its file names
     claims: Callable[[bytes], bool]  # whether these first `HEAD_BYTES` are of this format
     open: Opener
-    format: str  # `format` in the store of a recording that is one such file
-    bag_format: str  # `format` in the store of a recording that is a folder of such files
-    # For a format that is a folder: yields its files; `claims` gets the beginning of the first.
+    format: str  # value of `format` in the store if a recording is one such file
+    bag_format: str  # value of `format` in the store if it is a folder of such files
+    # Only for a format that is a folder: yields its files; `claims` gets the start of the first.
     files: Callable[[Path], Iterator[Path]] | None = None
 
 
@@ -219,12 +219,12 @@ MAX_MESSAGE = 1 << 30
 PIECE = 32 << 20  # bytes of decompressed messages that are yielded at a time
 BLOCK = 1 << 12  # bytes given to zstd at a time, which become 128 MiB at most
 RATIO = 1000  # largest plausible ratio of compression: a larger one is an attack or an accident
-CHUNK = 64 << 20  # bytes that are plausible for a chunk of any stored size: they do no harm
-FILE = 256 << 20  # the same for a file
+CHUNK = 64 << 20  # decompressed bytes that any chunk may have, as so few do no harm
+FILE = 256 << 20  # decompressed bytes that any file may have
 
 
 def max_plausible_bytes(stored: int, at_least: int = CHUNK) -> int:
-    """Return the largest plausible size of `stored` compressed bytes."""
+    """Return the most bytes to which `stored` compressed bytes may plausibly decompress."""
     return max(at_least, RATIO * stored)
 
 
@@ -265,7 +265,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
 def decompress_batch(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
     """Yield the batch with zstd payloads decompressed, and the number of damaged payloads.
 
-    It comes in pieces of about PIECE bytes, as it may be many times larger decompressed.
+    The batch comes in pieces of about PIECE bytes, as decompression may multiply its size.
 
     The first four bytes of a payload show whether it is compressed: CDR starts with two zeros, or
     with a zero and another small number.
@@ -342,7 +342,7 @@ class TopicInfo:
     skipped: str | None  # why it cannot be decoded, or None
 
 
-FAR_BACK_NS = 100_000_000  # if a topic's log time goes back further, its clock was set back
+FAR_BACK_NS = 100_000_000  # if a topic's log time goes back further, the clock was set back
 
 
 @dataclass
@@ -394,10 +394,10 @@ class TopicReading:
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
         no_times = np.zeros(0, np.int64)
         self._log = GrowingArray(no_times)
-        self._publish: GrowingArray | None = None  # None while all equal the log times
+        self._publish: GrowingArray | None = None  # None while they equal the log times
         self._fields: dict[str, GrowingArray | GrowingRagged] = {}
         self.decodable = False
-        self.interleaved = False  # several channels in a file: batches are not in its order
+        self.interleaved = False  # several channels in a file: batches are out of file order
 
     @property
     def paths(self) -> list[str]:
@@ -463,7 +463,7 @@ class TopicReading:
             self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
 
     def close(self, lost: Mapping[str, int]) -> Account:
-        """Return the account; add the `lost` messages, and those that are counted but missing."""
+        """Add `lost` messages, and those that are counted but never came; return the account."""
         account = self._account
         self._add(lost)
         unexplained = account.expected - account.decoded - sum(account.reasons.values())
