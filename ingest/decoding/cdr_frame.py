@@ -24,7 +24,7 @@ TOO_SHORT = "mis-sized: it ends before its last field"
 TOO_LONG = "mis-sized: bytes are left after its last field"
 NOT_TEXT = "text that is not valid UTF-8"
 UNTERMINATED = "text without its terminating zero"
-_LOOP_BYTES = 512  # longer rows are copied one by one: cheaper than an index per value
+_LOOP_BYTES = 512  # rows with more bytes on average are copied one by one, which is faster then
 
 
 class BadRows(Exception):
@@ -79,10 +79,10 @@ class Frame:
         self.buffer = buffer
         self.text_buffer = text_buffer or TextBuffer(buffer)
         self.order = order  # "<" or ">"
-        self.origin = origin  # (N,) the message's first byte in the buffer; alignment is from it
-        self.end = end  # (N,) end of the message, from its origin
+        self.origin = origin  # (N,) first byte of each message in the buffer; fields align to it
+        self.end = end  # (N,) end of each message, in bytes from `origin`
         self.rows = rows  # (N,) row of the message in the batch
-        self.position = position  # cursor, from the origin
+        self.position = position  # cursor, in bytes from `origin`
 
     def __len__(self) -> int:
         return len(self.origin)
@@ -204,7 +204,7 @@ def _decode(pieces: list[bytes], frame: Frame, known: dict[bytes, str]) -> list[
     return decoded
 
 
-PADDING_BETWEEN = 64  # unwanted bytes that are gathered along with wanted ones around them
+PADDING_BETWEEN = 64  # most bytes between wanted fields that are gathered together
 SECOND_NS = 1_000_000_000
 
 
@@ -212,8 +212,8 @@ SECOND_NS = 1_000_000_000
 class FixedField:
     """A field of fixed size: a primitive, or a fixed array of primitives."""
 
-    dtype: np.dtype[Any]  # "<" is implied
-    count: int | None  # of a fixed array
+    dtype: np.dtype[Any]  # in any byte order: the messages' is set later
+    count: int | None  # length of a fixed array; None: one value
     align: int
     path: str | None  # None: not wanted
     part: str = ""  # "sec" or "nanosec" of a time
@@ -286,7 +286,7 @@ class FixedFields:
         frame.position = stop
 
     def take(self, frame: Frame, at: Ints, layout: _Layout, out: Columns) -> None:
-        """Gather the wanted fields at these byte positions, which must fit."""
+        """Gather the wanted fields at byte positions `at`; the caller has checked the bounds."""
         times: dict[str, NDArray[np.int64]] = {}
         for first, structures in layout.groups:
             structs = gather(frame.buffer, at + first, structures[frame.order])
@@ -305,7 +305,7 @@ class FixedFields:
                     out[str(field.path)] = values
 
     def stride(self, phase: int) -> int | None:
-        """Return the distance between elements of these fields; None if it varies."""
+        """Return the bytes from one element of these fields to the next; None if that varies."""
         size = self.layouts[phase].size
         return size if (phase + size) & self.mask == phase else None
 

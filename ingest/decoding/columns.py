@@ -54,7 +54,7 @@ class Ragged:
         """Select rows, in this order."""
         lengths = self.lengths[rows]
         offsets = offsets_of(lengths)
-        # Element j of the output comes from where its row starts, plus its place in the row.
+        # A value comes from where its row starts in `self.values`, plus its index in the row.
         source = np.repeat(self.offsets[:-1][rows] - offsets[:-1], lengths) + np.arange(offsets[-1])
         return Ragged(take(self.values, source), offsets)
 
@@ -112,19 +112,18 @@ def equal(left: FieldColumn, right: FieldColumn) -> bool:
 def gather(buffer: NDArray[np.uint8], at: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Gather one value of `dtype` (also a structure or array) at each byte position, (N, …).
 
-    The values must lie within the buffer. All bytes of a value are moved at once, whatever its
-    fields.
+    The values must lie within the buffer. Each is copied as a block, not field by field.
     """
     size = dtype.itemsize
     if not len(at) or not size:
         return np.zeros(len(at), dtype)
     raw = np.dtype((np.void, size))
     everywhere: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), raw, buffer, strides=(1,))
-    values = everywhere[at]  # numpy moves opaque values as they are: faster than structures
+    values = everywhere[at]  # numpy copies opaque values faster than structures
     if dtype.subdtype:
         base, shape = dtype.subdtype
         return values.view(base).reshape(len(at), *shape)
-    return np.ndarray((len(at),), dtype, values)  # `view` first checks every field, slowly
+    return np.ndarray((len(at),), dtype, values)  # not by `view`, which checks every field
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ class TopicColumns:
     log_time_ns: Ints  # (N,) when the recorder received it
     publish_time_ns: Ints  # (N,) when the sender sent it; the log time if unknown
     fields: dict[str, FieldColumn] = field(default_factory=dict)  # by field path
-    lap: Ints | None = None  # (N,) jumps far back of log time before each; None: no jumps
+    lap: Ints | None = None  # (N,) how often log time jumped far back before; None: never
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -215,7 +214,7 @@ def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
     return GrowingRagged(empty) if isinstance(empty, Ragged) else GrowingArray(empty)
 
 
-DEEPEST = 24  # nested messages; real ones reach 6
+DEEPEST = 24  # deepest nesting of messages; real types reach 6
 MAX_FIELDS = 20_000
 MAX_WHY = 300  # characters of a reason, which may quote a definition
 
@@ -298,8 +297,8 @@ class MessageType(ABC):
     def leaves(self) -> list[Leaf]:
         """Return every field path of the type, in the order of its definition.
 
-        A message that contains its own type has endless paths. They are left out from where it
-        repeats (`leaf` still resolves each).
+        A message that contains its own type has endless paths. Paths that repeat the type are left
+        out; `leaf` still resolves them.
 
         Raises:
             CannotDecode: it nests too deeply, or has too many fields.

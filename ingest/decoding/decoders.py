@@ -68,7 +68,7 @@ class CdrPlan:
     """The operations of one message type, in the order of its serialisation."""
 
     operations: list[Operation]
-    paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, lengths of repetitions
+    paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted path -> kind, array lengths
 
     def decode(self, frame: Frame) -> Columns:
         """Decode the wanted fields of all messages, and move the cursor past the last field.
@@ -96,7 +96,7 @@ def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
 
 
 def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Ints) -> FieldColumn:
-    """Group elements into rows: a fixed repetition becomes an axis, others become Ragged."""
+    """Group elements into rows: arrays of a fixed `length` as an axis, sequences as Ragged."""
     if length is not None and not isinstance(column, Ragged):
         return column.reshape(rows, length, *column.shape[1:])
     return Ragged(column, offsets)
@@ -164,7 +164,7 @@ class Repeat:
     """A sequence or fixed array of messages or texts; `inner` decodes each element."""
 
     inner: CdrPlan
-    length: int | None  # of a fixed array
+    length: int | None  # length of a fixed array; None: a sequence
     ros1: bool
 
     @cached_property
@@ -176,7 +176,7 @@ class Repeat:
     def decode(self, frame: Frame, out: Columns) -> None:
         """Decode all elements of all messages, as far as possible at once."""
         count = self.length if self.length is not None else frame.read_uint32(1 if self.ros1 else 4)
-        if not self.inner.operations:  # ROS 1: messages without fields take no bytes
+        if not self.inner.operations:  # in ROS 1, elements without fields take no bytes
             return
         counts = spread(count, len(frame))
         # An element takes at least a byte: refuse impossible counts before allocating.
@@ -193,7 +193,7 @@ class Repeat:
             out[path] = wrap(column, self.length, len(frame), offsets)
 
     def _fixed(self, frame: Frame, counts: Ints, offsets: Ints) -> Columns | None:
-        """Gather elements of one fixed size, whose positions are known; None for others."""
+        """Gather all elements at once if they have one fixed size; return None if not."""
         fields = self._only_fixed
         if fields is None:
             return None
@@ -225,7 +225,7 @@ class _Elements:
         self.inner, self.frame = inner, frame
         self.counts, self.offsets = counts, offsets
         self.position = spread(frame.position, len(frame)).copy()
-        self.places: list[Ints] = []  # indices of `parts`' elements in the result
+        self.places: list[Ints] = []  # for each of `parts`, its elements' indices in the result
         self.parts: list[Columns] = []
 
     def read(self) -> Columns:
@@ -308,7 +308,7 @@ class _Compiler:
 
     def _message(self, name: str, prefix: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         fields = self.message.fields_of(name)
-        if not fields and not self.ros1:  # C and C++ have no empty structure: it takes a byte
+        if not fields and not self.ros1:  # C has no empty structure, so ROS 2 gives it a byte
             fixed.append(FixedField(np.dtype(np.uint8), None, 1, None))
         for part in fields:
             self._field(part, prefix + part.name, plan, fixed)
@@ -355,7 +355,7 @@ class _Compiler:
             plan.paths[inner_path] = (kind, (length, *dims))
 
     def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
-        """Add the two fields of a time: as one in nanoseconds, each by its own path, or both."""
+        """Add a time's two fields as wanted: as one value in ns, each by its own path, or both."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
         if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
@@ -395,7 +395,7 @@ def compile_plan(message: RosType, wanted: frozenset[str], *, ros1: bool = False
 
 
 HEADER = 4  # bytes of the encapsulation header
-PADDING = 3  # a payload is padded to a multiple of four
+PADDING = 3  # most bytes after the last field: payloads are padded to a multiple of four
 RESTARTS = 16  # attempts, each without the rows that failed, before the rows are halved
 
 _ENCAPSULATIONS = {
@@ -486,7 +486,7 @@ class ColumnDecoder:
 
 
 READABLE = ("cdr", "ros1", "json", "protobuf")
-SAMPLE_BYTES = 4 << 20  # of first messages, from which fields are inferred
+SAMPLE_BYTES = 4 << 20  # bytes of the first messages, from which fields are inferred
 SAMPLE_MESSAGES = 1000
 
 

@@ -38,15 +38,15 @@ from restock.ingest.decoding.columns import (
 
 # A message inside another one is preceded by a line of "=" and a line with its name.
 _RULE = re.compile(r"^=+[ \t]*\n\s*(?:MSG|IDL):[ \t]*([\w/]+)[ \t]*(?:\n|\Z)", re.MULTILINE)
-# Text that no field depends on: strings, comments, and lines for a preprocessor. What an #include
-# names is part of the definition anyway, and so an include guard never hides anything.
+# Text that no field depends on: strings, comments, and preprocessor lines. Included files are part
+# of the definition anyway, so lines with #include or an include guard can be ignored.
 _ASIDE = re.compile(
     r'(?P<string>"(?:\\.|[^"\\])*(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)'
     r"|^[ \t]*#[ \t]*(?:(?:include|pragma|ifndef|endif)\b|define[ \t]+\w+[ \t]*$)[^\n]*",
     re.DOTALL | re.MULTILINE,
 )
 _HEADER = re.compile(r"^[ \t]*Header\b", re.MULTILINE)
-# The IDL parser takes exponential time if these are nested, which rosidl does not write.
+# Nested brackets, which rosidl does not write, would take the IDL parser exponential time.
 _ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
 _NESTED = re.compile(r"(?:<[^<>]*){4}")
 MAX_PLACE = 60  # characters of the text that an error quotes
@@ -64,13 +64,13 @@ def types_in(content: bytes, name: str, form: str) -> Typesdict:
     try:
         text = re.sub(r"\r\n?", "\n", content.decode("utf-8-sig"))
         first, *rest = _RULE.split(text)
-        parts = {normalize_msgtype(name): first}  # rosbag2 has no rule before it in .msg texts
+        parts = {normalize_msgtype(name): first}  # in .msg texts, no `_RULE` precedes it
         parts |= zip(map(normalize_msgtype, rest[::2]), rest[1::2], strict=True)
         for part, lines in parts.items():
             if form == "ros2idl":
                 types.update(_idl_types(lines))
                 continue
-            own = f"{part.rpartition('/')[0]}/Header"  # ROS 1 and rosbags always take std_msgs'
+            own = f"{part.rpartition('/')[0]}/Header"  # rosbags would take std_msgs/Header
             if form == "ros2msg" and own in parts.keys() - {part}:
                 lines = own.join(_HEADER.split(lines))
             types.update(get_types_from_msg(lines, part))
@@ -102,7 +102,7 @@ def _parse_end(error: Exception) -> str:
 
 LARGEST = 512 << 10  # bytes of one file
 MAX_FILES = 5000
-# ackermann_msgs: not in any distribution's core, but the commands of every robot that steers.
+# No distribution's core has ackermann_msgs, but every robot that steers has it for commands.
 ACKERMANN = {
     "ackermann_msgs/msg/AckermannDrive": (
         "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -163,7 +163,7 @@ def _refused(folder: str, why: str) -> RecordingError:
 
 DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
-MAX_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
+MAX_DEFINITION = 512 << 10  # bytes; real definitions have up to some 50 kB, and parsing is slow
 MAX_ARRAY = 1 << 20
 KEPT = 1024  # cached types of recordings
 
@@ -279,7 +279,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
 @cache
 def _distro_type(name: str, distro: str) -> RosType:
     kind = RosType(name, distro, distro_types(distro))
-    kind.leaves()  # refuses what is not supported
+    kind.leaves()  # raises CannotDecode if something is not supported
     return kind
 
 
@@ -289,15 +289,15 @@ def _embedded_type(name: str, form: str, definition: bytes, distro: str) -> RosT
         types = types_in(definition, name, form)
     except CannotDecode as error:
         raise CannotDecode(f"its definition {error}") from error
-    if form == "ros1msg":  # time and duration are primitives there
+    if form == "ros1msg":  # time and duration are not defined in them, as ROS 1 has them built in
         types = {**distro_types("ros1_noetic"), **types}
     source = "embedded"
     missing = _referenced_messages(types) - types.keys()
-    if missing:  # some writers omit inner messages; if those differ, sizes will not fit
+    if missing:  # some writers omit inner messages; a wrong substitute will not fit in size
         types = {**distro_types(distro), **types}
         source = f"embedded, and {distro}"
     kind = RosType(name, source, types)
-    kind.leaves()  # refuses what is not supported
+    kind.leaves()  # raises CannotDecode if something is not supported
     return kind
 
 

@@ -96,7 +96,7 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
             f"its definition does not define {name or 'a type without a name'}"
         ) from None
     kind = ProtobufType(name, pool)
-    kind.leaves()  # refuses what is not supported
+    kind.leaves()  # raises CannotDecode if something is not supported
     return kind
 
 

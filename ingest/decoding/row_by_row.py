@@ -62,7 +62,7 @@ class Decoder(Protocol):
 
 
 class Unparsable(Exception):
-    """A message that does not fit its type. Its reason quotes no values, so equal ones add up."""
+    """A message that does not fit its type. Its reason quotes no values, so it can be counted."""
 
 
 class Parser(Protocol):
@@ -166,7 +166,7 @@ def column_of(messages: Sequence[Any], leaf: Leaf, parser: Parser) -> FieldColum
 
 
 def _wrap(column: FieldColumn, levels: list[tuple[int | None, list[int]]]) -> FieldColumn:
-    """Nest flat values, from the innermost repetition out."""
+    """Group flat values into nested rows, from the innermost repetition to the outermost."""
     for length, counts in reversed(levels):
         if length is not None and not isinstance(column, Ragged):
             column = column.reshape(len(counts), length, *column.shape[1:])
@@ -198,8 +198,8 @@ class Node:
     """What is known about the values at one path of the messages."""
 
     seen: Counter[str] = field(default_factory=Counter)  # values by JSON Schema's kind, except null
-    members: dict[str, Node] = field(default_factory=dict)  # of objects
-    items: Node | None = None  # of arrays
+    members: dict[str, Node] = field(default_factory=dict)  # values of objects' members, by name
+    items: Node | None = None  # values in arrays
     declared: bool = False  # the schema defines it, whatever the messages have
     widest: int = 0  # largest magnitude of the integers seen
 
@@ -239,7 +239,7 @@ class JsonType(MessageType):
                     try:
                         _observe(root, parse(payload), 0)
                     except Unparsable:
-                        continue  # counted when the message is read
+                        continue  # a bad message is counted when it is read
             self._fields = {}
             _Fields(self._fields).add(self.name, root)
         return self._fields.get(name, [])
@@ -290,7 +290,7 @@ class _Schema:
         if self._count > MAX_FIELDS:
             raise CannotDecode(f"its definition has more than {MAX_FIELDS:,} fields")
         if isinstance(schema, dict) and isinstance(target := schema.get("$ref"), str):
-            if target in within:  # it contains itself: its endless paths are left out
+            if target in within:  # the type contains itself: leave out its endless paths
                 return Node(declared=True)
             return self._node(self._at(target), depth, within | {target})
         if not isinstance(schema, dict) or depth >= DEEPEST:
@@ -365,7 +365,7 @@ class _Fields:
             self._count += 1
             if self._count > MAX_FIELDS:
                 raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
-            # In a path, dots and brackets of a name would be ambiguous.
+            # Leave out names with dots or brackets, which would be ambiguous in a path.
             if member and member.isprintable() and "." not in member and "[]" not in member:
                 made = self._field(f"{name}.{member}", member, inner, None)
                 fields += [made] if made else []
