@@ -65,7 +65,7 @@ class CommandForm:
             ConfigError: `kind` is neither the profile's command nor a twist.
         """
         command = profile.inputs.command
-        measured = is_motion(command.type)  # commands were not recorded
+        measured = is_motion(command.type)  # the measured motion stands in for unrecorded commands
         topic = topic or ("/cmd_vel" if measured else command.topic)
         kind = kind or ("geometry_msgs/msg/Twist" if measured else command.type)
         if kind == command.type:
@@ -84,7 +84,7 @@ class CommandForm:
         turn = yaw_rate_radps
         if not (math.isfinite(speed_mps) and math.isfinite(turn)):
             speed_mps = turn = 0.0
-        if self.wheelbase_m is not None:  # standing still it cannot turn
+        if self.wheelbase_m is not None:  # at speed 0 a steered robot cannot turn
             turn = math.atan(turn * self.wheelbase_m / speed_mps) if speed_mps else 0.0
         for path, value in ((self.speed, speed_mps), (self.turn, turn)):
             *way, last = path.split(".")
@@ -96,7 +96,7 @@ class CommandForm:
 
 
 def with_node_topics(profile: Profile) -> Profile:
-    """Return the profile with inputs from the node's topics, besides the robot's own."""
+    """Return the profile, extended by inputs and signals from the topics of this node."""
     form = CommandForm.of(profile)
     age_s = 2 * profile.task.control_period_s
 
@@ -137,7 +137,7 @@ def with_node_topics(profile: Profile) -> Profile:
 
 
 def quality(ros: Any, depth: int, *, reliable: bool = True, latched: bool = False) -> Any:
-    """Return a quality of service; without `reliable` it matches every publisher's.
+    """Return a quality of service; if not `reliable`, a subscription accepts any publisher.
 
     With `latched`, late subscribers also get the last message.
     """
@@ -189,8 +189,8 @@ def _message_class(kind: str) -> Any:
 
 DIAGNOSTICS_S = 1.0
 DISCOVERY_S = 1.0
-MAX_AHEAD_S = 0.2  # of a stamp to the node's clock: simulators publish /clock at 10 Hz or more
-ACKED_S = 0.5  # longest wait per topic for a subscriber that hangs to get the last stop
+MAX_AHEAD_S = 0.2  # limit of stamps ahead of the clock: simulators publish /clock at 10 Hz or more
+ACKED_S = 0.5  # longest wait, per topic, until subscribers acknowledge the last stop
 WAKE_S = 0.2  # SIGINT and SIGTERM are handled within this time
 NAME = "restock_policy"
 
@@ -210,14 +210,14 @@ class PolicyNode:
         self._published: dict[str, Any] = {}
         self._reports: Any = None
         self._subscriptions: dict[str, Any] = {}  # best effort, which matches any publisher
-        self._latched: dict[str, Any] = {}  # additional ones, while a publisher latches
-        self._latching: dict[str, Any] = {}  # topic that a publisher may latch -> its class
+        self._latched: dict[str, Any] = {}  # additional subscriptions, while a publisher latches
+        self._latching: dict[str, Any] = {}  # topic that may be latched -> message class
         self._timers: list[Any] = []
         self._parameter("policy", str(policy))
         self._parameter("profile", "")
         self._parameter("shadow", not drive)
         self._parameter("limiter", True)
-        self._parameter("cmd_vel_topic", "")  # "" in both: the profile's
+        self._parameter("cmd_vel_topic", "")  # "" here and below: as in the profile
         self._parameter("cmd_vel_type", "")
 
     # -- transitions ----------------------------------------------------------------------------
@@ -272,7 +272,7 @@ class PolicyNode:
         }
         self._latching = {topic: classes[topic] for topic in sorted(pilot.latched)}
         self._match_latched()
-        # Control ticks are by the node's clock, which obeys use_sim_time; the rest by a steady one.
+        # Control ticks follow the node's clock, which obeys use_sim_time; the rest, a steady clock.
         steady = self.ros.Clock(clock_type=self.ros.ClockType.STEADY_TIME)
         self._timers = [
             self.node.create_timer(task.control_period_s, self._tick),
@@ -334,9 +334,9 @@ class PolicyNode:
         return self.node.create_subscription(kind, topic, partial(self._receive, topic), qos)
 
     def _match_latched(self) -> None:
-        """Subscribe to a topic's last message while a publisher latches it.
+        """Subscribe to latched messages of each topic that a publisher latches now, and only then.
 
-        To such a subscription, other publishers would send nothing, and both sides would warn.
+        From publishers that do not latch, such a subscription gets nothing, and both sides warn.
         """
         keeps = self.ros.DurabilityPolicy.TRANSIENT_LOCAL
         for topic, kind in self._latching.items():
@@ -359,7 +359,7 @@ class PolicyNode:
         began_s = time.monotonic()
         decision = self.pilot.decide(self._now_ns())
         self._decided_s = time.monotonic()
-        late = self._decided_s - began_s > self.watchdog_s  # the watchdog has stopped it meanwhile
+        late = self._decided_s - began_s > self.watchdog_s  # the watchdog has stopped the robot
         with self._commanding:
             if not self.active:
                 return
@@ -373,7 +373,7 @@ class PolicyNode:
             self._command(*((0.0, 0.0) if late else decision.command))
 
     def _publish_shadow(self, decision: Decision) -> None:
-        """Publish what it would do and why, to be recorded, whoever drives."""
+        """Publish the decision and the limiter's rule, to be recorded, whoever drives."""
         rule = self._classes["limiter"]()
         rule.data = decision.rule
         self._published["limiter"].publish(rule)
@@ -395,7 +395,7 @@ class PolicyNode:
                     self._command(0.0, 0.0)
 
     def _is_driving(self) -> bool:
-        """Return whether its commands drive the robot."""
+        """Return whether this node's commands drive the robot."""
         return (
             not self.shadow and self.pilot is not None and not self.pilot.taken_over(self._now_ns())
         )
@@ -524,13 +524,13 @@ def lifecycle_node(ros: Any, policy: Path, *, drive: bool = False) -> Any:
             return super().on_configure(state)
 
         def on_activate(self, state: Any) -> Any:
-            enabled = super().on_activate(state)  # the publishers first
+            enabled = super().on_activate(state)  # enables the publishers
             if enabled == returned.SUCCESS:
                 self.policy.activate()
             return enabled
 
         def on_deactivate(self, state: Any) -> Any:
-            self.policy.deactivate()  # a stop, while the publishers still publish
+            self.policy.deactivate()  # publishes a stop, so before the publishers are disabled
             return super().on_deactivate(state)
 
         def on_cleanup(self, state: Any) -> Any:
@@ -555,14 +555,14 @@ def run_node(ros: Any, policy: Path, *, drive: bool = False, activate: bool = Fa
     """Spin the node until SIGINT or SIGTERM; stop the robot before it ends. Returns 0."""
     import signal
 
-    # rclpy's own handlers would end the context before a last stop could be published. Python's run
-    # only after a wait for messages, so the wait is short. A launch may send several signals.
+    # rclpy's signal handlers would end the context before a last stop could be published. Python's
+    # handlers run only after a wait for messages: WAKE_S is short. A launch may signal repeatedly.
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     ros.rclpy.init(signal_handler_options=ros.SignalHandlerOptions.NO)
     node = lifecycle_node(ros, policy, drive=drive)
-    executor = ros.MultiThreadedExecutor(num_threads=2)  # one for the watchdog
+    executor = ros.MultiThreadedExecutor(num_threads=2)  # so that one is free for the watchdog
     executor.add_node(node)
     try:
         if activate:

@@ -36,9 +36,9 @@ _DELAYS = 200  # last delays of each topic, whose median is used
 
 
 class LiveClock:
-    """Estimates log time less the robot's time, from stamped messages in the order of log time.
+    """Estimates the offset, log time less the robot's time, from messages in order of log time.
 
-    A message is off the clock if its stamp is more than `jump_ns` from what this offset gives.
+    A message is off the clock if its log time less its stamp is over `jump_ns` from the offset.
     """
 
     def __init__(self, jump_ns: int) -> None:
@@ -82,8 +82,8 @@ class Observed:
     """An observation at a tick, and whether it can be used."""
 
     observation: NDArray[np.float32]  # (D,)
-    stamp_ns: int  # of the tick on the alignment clock
-    previous_action: int  # nearest to the command since the last tick; 0 (stop) without one
+    stamp_ns: int  # time of the tick on the alignment clock
+    previous_action: int  # nearest to the command since the last tick; 0 (stop) if none came
     problem: str  # why the robot must not act on it, or ""
     signals: Signals  # at the tick, one row each; empty if nothing could be observed
 
@@ -98,8 +98,8 @@ class _Message:
 class LiveObserver:
     """Takes messages as they are received, and computes the observation at a tick.
 
-    A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags'). Older
-    messages than the last tick needed are dropped, so memory does not grow.
+    A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags').
+    Messages that no later tick needs are dropped, so memory does not grow.
 
     Args:
         profile: which topics to observe, and how.
@@ -131,7 +131,7 @@ class LiveObserver:
         """Discard all messages; needed if the clock was set or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._clock = LiveClock(round(JUMP_S * NS))
-        self._command: _Message | None = None  # the first since the last tick, or an earlier one
+        self._command: _Message | None = None  # first since the last tick; if none, an earlier one
         self._ticked = True
         self._before_ns: int | None = None
         self._tracker = Tracker(self.task) if self.task.tracks else None
@@ -226,7 +226,7 @@ class LiveObserver:
                 self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:
-        """Return the command in force since the tick before; this tick's is still to come."""
+        """Return the command since the last tick, for all `ticks`; the next is not known yet."""
         fields: dict[str, FieldColumn] = {
             path: np.zeros(1) for path in field_paths(self.profile.inputs.command)
         }
@@ -278,7 +278,7 @@ def _estimate_flags(message: Any, sources: Sequence[Input]) -> dict[str, FieldCo
         for rule in conventions_of(source.type, path)
         if rule.of_messages
     )
-    with suppress(AttributeError):  # another package's type with the same name
+    with suppress(AttributeError):  # the type may be another package's and lack these fields
         return {path: _column(message, path) for rule in rules for path in rule.fields}
     return {}
 

@@ -30,7 +30,7 @@ from restock.ingest.task.task import nearest_action
 OPERATORS = ("operator", "teleop", "joystick")  # command sources that are people
 BOOL = "std_msgs/msg/Bool"
 ACTIVE_S = 0.5  # a person drives for this long after their last command
-OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # raised by reading such messages
+OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # raised by reading another type
 
 
 @dataclass(frozen=True)

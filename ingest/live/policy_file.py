@@ -35,7 +35,7 @@ from restock.ingest.task.task import Task
 from restock.process import import_extra
 
 FORMAT = "restock-policy/2"
-MAX_BYTES = 16 << 20  # of a file: 4 million weights. Parsed, it takes at most .8 GB
+MAX_BYTES = 16 << 20  # limit of a file: 4 million weights, which take .8 GB at most when parsed
 MAX_PARTS = 256  # nodes, constants, metadata entries
 MAX_WIDTH = 1 << 16  # numbers that a node computes from one observation
 _TOO_LONG = f"is longer than {MAX_BYTES >> 20} MiB"
@@ -55,7 +55,7 @@ class PolicyFile:
     """
 
     def __init__(self, path: Path, profile: Path | str | None = None) -> None:
-        """`profile`, a file or a name, replaces the profile in the policy file."""
+        """Read the policy; `profile`, a file or a name, replaces the profile in its file."""
         self.path, self._file = path, OnnxFile(path)
         metadata = self._file.metadata
         if not self._file.of_restock:
@@ -71,7 +71,7 @@ class PolicyFile:
     def act(self, observation: F32) -> int | None:
         """Return the best action for an observation (D,); None if its value is not finite."""
         (values,) = self._file.values(observation[None])
-        # `argmax` returns the first NaN, an action without meaning.
+        # If a value is NaN, `argmax` returns its index, an action without meaning.
         action = int(values.argmax())
         return action if np.isfinite(values[action]) else None
 
@@ -175,7 +175,7 @@ def with_digest(data: bytes) -> bytes:
 
 
 def _digest_entry(data: bytes) -> bytes:
-    # Appended fields continue a protobuf message: here with 75 bytes, whatever the data.
+    # A protobuf message can be extended by appending fields; this one always takes 75 bytes.
     entry = {"key": _DIGEST, "value": hashlib.sha256(data).hexdigest()}
     content: bytes = _Model(metadata_props=[entry]).SerializeToString()
     return content
@@ -220,7 +220,7 @@ _FLOAT, _INT = 1, 2  # types of attributes
 _TYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype("<f4"),
     7: np.dtype("<i8"),
-}  # of tensors: float32 and int64
+}  # types of tensors: float32 and int64
 
 
 def _model_class() -> Any:
@@ -332,7 +332,7 @@ def _broadcast_shape(shapes: Sequence[Shape], settings: Mapping[str, float], val
     aligned = [(1,) * (rank - len(shape)) + shape for shape in shapes]
     result: list[int | str] = []
     for sizes in zip(*aligned, strict=True):
-        (size,) = set(sizes) - {1} or {1}  # more than one: ValueError
+        (size,) = set(sizes) - {1} or {1}  # ValueError for two sizes other than 1
         result.append(size)
     return tuple(result)
 
