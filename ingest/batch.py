@@ -55,12 +55,12 @@ class IngestJob:
     force: bool = False
     salvage: bool = False
     definitions: str | None = None
-    repeated: OnRepeat = "keep"  # for a drive that is in the store under another recording id
+    repeated: OnRepeat = "keep"  # what to do with a drive that is stored under another id
     tags: Mapping[str, str] = field(default_factory=dict)  # given to every recording
 
     @cached_property
     def writer(self) -> StoreWriter | None:
-        """Return the store's writer; `dataclasses.replace(job)` makes a job with a new writer."""
+        """Return the store's writer, created once per job; a copy by `replace` creates its own."""
         from restock.ingest.store.writer import StoreWriter
 
         return StoreWriter(self.store) if self.store is not None else None
@@ -71,7 +71,7 @@ class IngestJob:
         watch: Watch | None = None,
         settle: Callable[[str], None] = lambda recording_id: None,
     ) -> Prepared | RestockError:
-        """Read one recording and write its files; return an error, so that the others go on."""
+        """Read one recording and write its files; return errors, so that other recordings go on."""
         from restock.ingest.pipeline import preparing
 
         try:
@@ -83,7 +83,7 @@ class IngestJob:
             return out_of_memory(path)
         except Exception as error:  # noqa: BLE001  (a bug must fail one recording, not all)
             print_traceback(error)
-            if isinstance(error, OSError) and error.strerror:  # of a disk or a network, not a bug
+            if isinstance(error, OSError) and error.strerror:  # a disk or network error, no bug
                 return RecordingError(
                     f"cannot be read or written: {error.strerror}",
                     where=str(path if error.filename is None else error.filename),
@@ -114,11 +114,11 @@ class IngestJob:
 
         def settle_first(recording_id: str) -> None:
             if recording_id in ids:
-                raise LookupError  # the same recording again: prepare it alone, after the first
+                raise LookupError  # the same recording again: the last loop prepares it alone
             settle(recording_id)
             ids.add(recording_id)
 
-        with suppress(Exception):  # `prepare` finds the recording and the error
+        with suppress(Exception):  # after an error in a shared call, the last loop does the rest
             options = {**self.options, **more, "settle": settle_first}
             works = [preparing(path, self.profile, **options) for path in paths if len(paths) > 1]
             for place, outcome in in_step(works):
@@ -148,15 +148,15 @@ def ingest_all(
 ) -> Iterator[Result]:
     """Ingest recordings; yield each path with its result or error, in order, after its commit.
 
-    A worker reads a recording and writes its files. This process commits the files of a few
-    seconds together, so the store is the same as with one worker. `watch` is called with the
-    progress within a recording, but only with one worker. If the caller stops early, recordings
-    that are not yet committed are discarded.
+    A worker reads a recording and writes its files. Only this process commits: every few seconds,
+    all files that are ready. So the store does not depend on the number of workers. `watch` is
+    called with the progress within a recording, but only with one worker. If the caller stops
+    early, recordings that are not yet committed are discarded.
     """
     from restock.ingest.pipeline import CommitGroup
 
     recordings = [Path(path) for path in paths]
-    own_job = replace(job)  # has its own writer: workers get `job` without what a writer has read
+    own_job = replace(job)  # a copy to create a writer in: `job` itself is sent to the workers
     group = CommitGroup(own_job.writer)
     processes = min(workers, len(recordings))
     if processes > 1:
@@ -221,7 +221,7 @@ def _prepare_in_workers(
 
 
 def _bundles(paths: Sequence[Path], most: int) -> list[list[int]]:
-    """Group the indices of consecutive recordings, up to `most` and MAX_BUNDLE_BYTES each."""
+    """Bundle consecutive paths, as indices: at most `most` and MAX_BUNDLE_BYTES in a bundle."""
     bundles: list[list[int]] = []
     total = 0
     for place, path in enumerate(paths):

@@ -76,16 +76,16 @@ class IngestResult:
     path: str
     status: Status
     manifest: dict[str, Any]  # the row of `recordings`, as plain values
-    messages: dict[str, int] = field(default_factory=dict)  # expected, decoded and unused ones
+    messages: dict[str, int] = field(default_factory=dict)  # numbers of expected, decoded, unused
     conditions: dict[str, int] = field(default_factory=dict)  # label -> transitions it holds on
-    named: dict[str, int] = field(default_factory=dict)  # … that have it as their `condition`
+    named: dict[str, int] = field(default_factory=dict)  # label -> rows with it as `condition`
     exposures: dict[str, int] = field(default_factory=dict)  # exposure -> transitions in it
     scores: list[LabelScore] = field(default_factory=list)
     endings: dict[str, int] = field(default_factory=dict)  # ending -> number of episodes
     lost_messages: list[str] = field(default_factory=list)  # lost messages or bytes, and why
-    contradictions: list[str] = field(default_factory=list)  # between topics; the rows keep them
+    contradictions: list[str] = field(default_factory=list)  # between topics; rows stay as read
     notes: list[str] = field(default_factory=list)
-    version: int | None = None  # of the table `transitions`, if this was committed
+    version: int | None = None  # version of the table `transitions`, if this was committed
     repeats: RepeatedDrive | None = None  # a stored recording with largely the same rows
 
     @property
@@ -218,7 +218,7 @@ def _has_other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
 
 @lru_cache(maxsize=64)  # many recordings share a profile
 def _stored_profile(text: str) -> Profile | None:
-    with suppress(ConfigError):  # another version of Restock wrote it
+    with suppress(ConfigError):  # another version of Restock may have written it
         return parse_profile(text, where="profile_toml")
     return None
 
@@ -322,7 +322,7 @@ class _Ingest:
         table: pa.Table,
         kept: Sequence[KeptFrames],
     ) -> Staged:
-        # With corrections, refuse to overwrite those that another process makes in the meantime.
+        # With corrections, fail if another process has made further ones since they were read.
         read = self.before["ingest_id"] if self.corrections else None
         with self._writing_frames(store, manifest, kept):
             return store.stage(row, table, instead_of=read)
@@ -476,7 +476,7 @@ def _repeat_error(
     if found is None or (prepared.repeated == "replace" and found.has_less):
         return None
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
-    if found.has_less:  # it was ingested while still being written, or salvaged
+    if found.has_less:  # the stored one was salvaged, or ingested before its end
         remedy = (
             f"this one holds more of the drive: {_removal(store, found.recording_id)} removes "
             "that one; then ingest this one again (--repeated replace does both), or keep both "
@@ -492,7 +492,7 @@ def _removal(store: StoreWriter, recording_id: str) -> str:
 def _commit(
     store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
 ) -> dict[int, IngestResult | StoreError | RecordingError]:
-    """Commit all at once or, if that fails, each alone; `begun` if a commit of them had begun."""
+    """Commit all at once or, if that fails, one by one; `begun`: a commit with them had begun."""
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
     if not several:
@@ -595,10 +595,10 @@ class CommitGroup:
         self.commit_if_due()
 
     def _copy(self, result: IngestResult) -> IngestResult | None:
-        """Return the result for a recording that came before with other tags; None if it did not.
+        """Return a result if the recording came before with other tags; None if it did not.
 
-        That happens if two paths have the same recording. The tags of the first path stay, or each
-        ingest of the two paths would change them.
+        That happens if two paths have the same recording. The first path's tags stay: otherwise,
+        every new ingest of both paths would change them.
         """
         first = self._first.setdefault(result.manifest.get("recording_id", ""), result)
         tags = first.manifest.get("tags") or {}

@@ -63,7 +63,7 @@ class Relabelled:
     before: str  # labels version
     after: str
     changed: int = 0  # rows with another `condition` than before
-    named: dict[str, int] = field(default_factory=dict)  # rows by their `condition`, after
+    named: dict[str, int] = field(default_factory=dict)  # condition -> rows that have it now
     named_before: dict[str, int] = field(default_factory=dict)
     scores: list[LabelScore] = field(default_factory=list)
 
@@ -124,7 +124,7 @@ def relabel_rows(
             where=str(store.path),
             remedy="ingest the recording again",
         )
-    stored = rows.select(ends.column_names)  # the signals, also those that the profile adds
+    stored = rows.select(ends.column_names)  # the signals, including the profile's own
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     conditions, exposures = (
@@ -207,7 +207,7 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
 class RecordingCorrections:
     """People's corrections of one recording's labels."""
 
-    ingest_id: str  # the rows that people judged
+    ingest_id: str  # the ingest whose rows people judged
     corrections: list[Correction]
 
 
@@ -316,7 +316,7 @@ def _correct_recording(
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     names = [condition.name for condition in conditions]
     scores = label_scores(rows, names, task.control_period_s)
-    # Keep `ingested_at`: the recording with the newest one decides which rules are the store's.
+    # Keep `ingested_at`: the recording with the newest time decides which rules the store has.
     manifest = row | {
         "ingest_id": ingest_id,
         "labels_version": rows["labels_version"][0].as_py(),
