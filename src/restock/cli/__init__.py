@@ -109,7 +109,7 @@ usage, bad input, a file that cannot be read or written, 3 written but data was 
 
 
 def _usage_of_jobs(verb: str) -> str:
-    """Return the text of `restock VERB --help` for a verb that consists of jobs alone."""
+    """Return the text of `restock VERB --help` for a verb that always needs a job."""
     return f"""usage: restock {verb} JOB [--help] …
 
 {VERBS[verb][0].upper()}{VERBS[verb][1:]}.
@@ -175,7 +175,7 @@ def _dispatch(args: list[str]) -> int:
         sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
     name, prog, rest = _named(args)
-    if name in JOBS and name not in FOLDER_OF:  # a verb that consists of jobs alone
+    if name in JOBS and name not in FOLDER_OF:  # a verb that needs a job
         return _say_jobs(name, rest)
     return _run(name, prog, rest)
 

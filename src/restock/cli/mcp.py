@@ -157,7 +157,7 @@ class _Questions:
         return dict(self._cut(read_json(file, error=RunError, remedy=remedy)))
 
     def _run_verb(self, *words: str) -> Any:
-        """Run a verb in a process that can be ended, and return what it prints as JSON."""
+        """Run a verb in a process for at most `seconds`, and return the JSON document it prints."""
         command = [sys.executable, "-m", "restock", *words, "--json"]
         try:
             done = subprocess.run(

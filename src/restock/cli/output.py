@@ -283,7 +283,7 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
 def print_plain(rows: Sequence[Row], columns: Sequence[str], *, values: bool = False) -> None:
     """Print a table with one line a row, however long, for files and pipes.
 
-    With `values` (the rows of a query), NULL is shown, and no column is padded beyond PIPE_WIDTH.
+    With `values` (the rows of a query), NULL is printed, and columns are padded up to PIPE_WIDTH.
     """
     numeric = [_numeric(rows, name) for name in columns]
     text = value_text if values else (lambda value: cell(value).replace(r"\[", "["))

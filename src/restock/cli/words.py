@@ -20,7 +20,7 @@ C = TypeVar("C")
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """An option. By default its name and metavar are those of the field's name and type."""
+    """An option. By default, its name and metavar come from the field's name and type."""
 
     metavar: str | None = None
     name: str | None = None

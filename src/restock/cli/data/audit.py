@@ -432,9 +432,9 @@ def audit_reward(
 ) -> RewardAudit:
     """Check whether more success earns a higher return, in a store's logs or a run's evaluations.
 
-    A reward that favours haste can give a driver that touches something in a quarter of its
-    missions a higher return than one that touches nothing; an agent trained on it learns to touch.
-    The returns of the drivers in the logs show this before any training.
+    If a reward favours haste, a driver that touches something in a quarter of its missions can get
+    a higher return than a driver that touches nothing, and an agent learns to touch. The returns
+    of the drivers in the logs show this before any training.
 
     Args:
         place: a store, or a run.

@@ -26,7 +26,7 @@ INSIDE = 0.5  # an outline with lidar returns inside it at more than this share 
 
 
 class Stop(Exception):
-    """Raised where a person must decide: tells why, and what to type or to edit."""
+    """Raised if a person must decide; contains the reason, and what to type or to edit."""
 
     def __init__(self, why: str, *remedies: str) -> None:
         super().__init__(why)

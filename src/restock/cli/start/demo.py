@@ -98,7 +98,7 @@ def find_logs() -> Path | None:
 
 
 def logs_alone(to: Settings) -> Path:
-    """Return the folder of the run that never drives, to compare fine-tuning with."""
+    """Return the folder of the run on logs alone, the baseline for fine-tuning in the twin."""
     return to.out / "logs-alone"
 
 

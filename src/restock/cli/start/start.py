@@ -25,8 +25,8 @@ SALVAGING = "add --salvage to this command: it reads what is intact in damaged r
 class Pipeline:
     """The stages from recordings to a report, run one after the other.
 
-    `to` has the settings that the stages share; it is replaced as stages end. `first` is one of the
-    recordings; a dry run names it without reading any.
+    `to` has the settings that the stages share; later stages get settings that earlier ones found.
+    `first` is one of the recordings, for the commands of a dry run, which reads no recording.
     """
 
     def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:

@@ -197,7 +197,7 @@ class Work:
         return self._stamps[-1]
 
     def _clear(self, stage: Stage) -> None:
-        """Remove the stage's files from an earlier call, or move them aside if it can resume."""
+        """Remove the stage's earlier files; if the stage has `resume`, move them to `earlier`."""
         for path in stage.writes:
             if not path.exists() or not path.resolve().is_relative_to(self.out.resolve()):
                 continue
