@@ -132,7 +132,7 @@ def _takes_a_stream(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-# A file that only one kind of Restock's folders has -> the name of that kind, for messages.
+# File that identifies a kind of folder -> name of the kind, for messages.
 _MARKS = {
     "panel.json": "the panel",
     "transitions/_delta_log": "the store",

@@ -109,7 +109,7 @@ def went_on_after_interrupt() -> None:
 
 
 def in_step(works: Sequence[Work[T]]) -> Iterator[tuple[int, T | Exception]]:
-    """Run coroutines side by side, and answer their requests for one function in one call.
+    """Run coroutines side by side; answer all their requests for the same function by one call.
 
     Yields the index of each coroutine that ends, with what it returned or raised. An error in a
     shared call is raised here, because it cannot be attributed to one coroutine.
