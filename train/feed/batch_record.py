@@ -56,7 +56,7 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-# Fresh rows held at most; beyond that, the oldest interval is written without all its labels.
+# Most fresh rows held back for labels; beyond that, the oldest interval is written unlabelled.
 _MAX_HELD = 1 << 21
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
@@ -68,9 +68,9 @@ class FeedRecord(Stateful):
         audit_share: share of batches that are audited, chosen by `seed`.
         actions: names of the task's actions; None: the table `actions` gets no rows.
         greedy: returns the policy's action (B,) for observations (B, D) of audited batches.
-        labels: of the ring's episodes as they end; None: rows are never labelled nor held back.
-        perturbations: in force in the ring's episodes, if they are known.
-        quotas: decides the shares of a batch; None: there are no quotas, and `fed` gets no rows.
+        labels: labels of the ring's ended episodes; None: rows are neither labelled nor held back.
+        perturbations: the perturbations in force in the ring's episodes; None: not known.
+        quotas: the controller of a batch's shares; None: no quotas, and `fed` gets no rows.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -115,17 +115,17 @@ class FeedRecord(Stateful):
         sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.strata) + 1}
         self._total = {name: np.zeros(size, np.int64) for name, size in sizes.items()}
         self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
-        # Audited batches of the open interval: their logged rows, and columns of the fresh ones.
+        # Audited rows of the open interval: greedy actions in logged rows, columns of fresh rows.
         self._greedy = SampledRows(GREEDY)
         self._audits: list[dict[str, Any]] = []
         self._held: list[HeldInterval] = []  # closed intervals, the oldest first
-        # Sum (S,) of the shares in force, over the open interval's batches with logged rows.
+        # Each stratum's share of the logged rows (S,), summed over the open interval's batches.
         self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
-        # Sum (S,) of the quotas, over all batches of the open interval.
+        # Each stratum's quota of the whole batch (S,), summed over the open interval's batches.
         self._wanted = np.zeros(0 if quotas is None else len(quotas.wanted))
         self._batches = 0
-        # The last batch and the one before: rows of the panel, the ring's episodes, their steps.
+        # The last two batches' rows: row in the panel; for fresh rows, episode key and step.
         none: NDArray[np.int64] = np.empty(0, np.int64)
         self._last: tuple[NDArray[np.int64], ...] = (none, none, none)
         self._before: tuple[NDArray[np.int64], ...] = self._last
@@ -140,9 +140,9 @@ class FeedRecord(Stateful):
         *,
         tail: Tensor | None = None,
     ) -> None:
-        """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
+        """Keep the batch of gradient step `step` (from 1), and audit it if the sample chooses it.
 
-        This is inside the update loop, so it keeps only what is gone when the interval is closed.
+        This runs inside the update loop, so it keeps only what is lost by the interval's end.
         `last_sync` is the update after which the target last moved; None if unknown. `tail` (B, 3)
         is the rows' action, reward and discount; None: they are read from the batch.
         """
@@ -222,7 +222,7 @@ class FeedRecord(Stateful):
         self._held = [HeldInterval(**interval) for interval in held]
 
     def _held_interval(self, clocks: dict[str, int], phase: str) -> HeldInterval:
-        """Return the open interval's fresh rows, audits and quotas, to hold them for labels."""
+        """Return the open interval's fresh rows, audits and quotas, to hold until labelled."""
         ring, filled = self.ring, len(self.ring)
         waiting = ring.by_condition.stratum[:filled] == WAITING
         available = self._count_by_stratum(ring.stratum[:filled][~waiting])
@@ -239,7 +239,7 @@ class FeedRecord(Stateful):
         return HeldInterval(clocks, phase, rows, available, open_rows, self._audits, quotas)
 
     def _count_by_stratum(self, stratum: NDArray[Any]) -> Ints:
-        """Count fresh rows (n,) by stratum (S + 1,); the last count is of rows in none."""
+        """Count fresh rows (n,) by stratum (S + 1,); the last counts rows in no stratum."""
         size = len(self.ring.strata)
         return np.bincount(_with_unlabelled(stratum, size), minlength=size + 1)
 
@@ -402,7 +402,7 @@ class FeedRecord(Stateful):
 
 
 def _with_unlabelled(code: NDArray[Any], kinds: int) -> Ints:
-    """Return codes (n,) of `kinds` names, with `kinds` in place of negative codes (no name)."""
+    """Return codes (n,) with negative ones, which have no name, replaced by the code `kinds`."""
     return np.where(code < 0, kinds, code).astype(np.int64)
 
 
@@ -419,8 +419,8 @@ def row_ids(
     ]
 
 
-STOPPED = "not_finite.json"  # in the run's directory
-_NAMED = 8  # rows in the message; the file has all of them
+STOPPED = "not_finite.json"  # file in the run's directory with the rows of the batch
+_NAMED = 8  # most rows that the message names; the file has all of them
 LEAVE_OUT = (
     "`restock trace PANEL PANEL_ROW` shows where such a row comes from; exclude it with the "
     "mixture's `where`, mix again and train again"
@@ -442,10 +442,10 @@ def check_fed(
     run: Path | None,
     steps: Mapping[str, int],
 ) -> None:
-    """Check a batch (B, W) of another library's loop, with its TD errors (B,) if they are known.
+    """Check a batch (B, W) of another library's loop, and its TD errors (B,) if they are known.
 
     Args:
-        rows: the ids of its rows, as `FeedRecord.last_batch` has them.
+        rows: returns the ids of the batch's rows, as `FeedRecord.last_batch` does.
         run: the run's directory, if there is one.
         steps: `env_steps` and `gradient_steps` so far.
 

@@ -41,12 +41,12 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, _NO_SHARES)
 class ReplayBatch:
     """One batch: the logged rows first, then the fresh ones."""
 
-    gather: Callable[[], Tensor]  # returns its rows, while the ring holds them
+    gather: Callable[[], Tensor]  # returns the packed rows, if none is overwritten in the ring yet
     weight: Tensor | None  # (B,) float32
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
     slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
-    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) shares of the logged rows
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) logged shares of K stores
     wanted: F64 = field(default_factory=lambda: np.empty(0))  # (S,) quotas of the whole batch
 
     @property
@@ -65,7 +65,7 @@ class Batches(Stateful):
     Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
 
     Args:
-        logs_share: share of an online batch; None: as the mixture of the logs' panel.
+        logs_share: logged rows' share of an online batch; None: as the panel's mixture says.
         fresh: (S,) which strata the ring's rows can be in; None: its rows are drawn uniformly.
 
     Raises:
@@ -92,8 +92,8 @@ class Batches(Stateful):
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
-        # Logged rows of an online batch, the rounding error carried over to the next, and the share
-        # that they were computed from. The last quota of fresh rows is for rows of any stratum.
+        # Number of logged rows in an online batch, its rounding error (added to the next number),
+        # and the share behind it. The last quota of fresh rows is for rows of any stratum.
         self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
         strata = 0 if fresh is None else len(fresh)
         self._fresh_quotas = Quotas(np.append(np.zeros(strata), 1.0), batch_size)
@@ -219,16 +219,16 @@ class Batches(Stateful):
 
 @dataclass(frozen=True)
 class LogTerms:
-    """Masks over the panel's rows on the learner's device; None if no loss term needs one."""
+    """The panel's rows that a loss term applies to, as a mask on the learner's device."""
 
-    expert: Tensor | None  # (n,) bool: DQfD's margin applies
+    expert: Tensor | None  # (n,) bool: rows with DQfD's margin term; None: the loss has none
 
     @classmethod
     def of(cls, config: TrainConfig, logs: Logs | None, device: torch.device) -> LogTerms:
-        """Make the masks that the loss needs on these logs.
+        """Make the mask that the loss needs on these logs.
 
         Raises:
-            ConfigError: the margin applies to a policy that the logs do not have, or to no logs.
+            ConfigError: the loss has a margin term, but there are no logs, or none of a policy.
         """
         if logs is None:
             _refuse_without_logs(config.loss)
@@ -239,7 +239,7 @@ class LogTerms:
         return cls(torch.from_numpy(expert).to(device))
 
     def expert_rows(self, log_rows: Ints) -> Tensor | None:
-        """Return `expert` of these rows (L,) of the panel."""
+        """Return whether the margin term applies to each panel row (L,); None: it never does."""
         if self.expert is None:
             return None
         return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
@@ -259,7 +259,7 @@ def draw_ahead(
 
 
 def check_terms(config: TrainConfig, panel: Panel | None) -> None:
-    """Raise the errors of `LogTerms.of`, but read only columns of the panel."""
+    """Raise the errors of `LogTerms.of` early, without reading the panel's packed rows."""
     if panel is None:
         _refuse_without_logs(config.loss)
     elif config.loss.margin:

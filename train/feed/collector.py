@@ -39,8 +39,8 @@ from restock.train.feed.teacher import CheckedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
-_EPISODES_PER_QUERY = 32  # planning a query takes as long as labelling a thousand steps
-_NO_VALUES = ("{}",)  # for a twin that reports a perturbation only by name
+_EPISODES_PER_QUERY = 32  # because planning a query costs as much as labelling 1,000 steps
+_NO_VALUES = ("{}",)  # perturbation values of a twin that reports only the name
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class EndedEpisode:
 
     env_steps: int
     gradient_steps: int
-    key: int  # of the ring
+    key: int  # the ring's key of the episode
     env: int
     episode_seed: int
     perturbation: str
@@ -59,7 +59,7 @@ class EndedEpisode:
     success: bool | None  # None: the task has no goal
     bumps: int
     steps: int
-    signals: Signals  # (steps + 1,) each
+    signals: Signals  # arrays (steps + 1,) by signal
     perturbation_values: str = "{}"  # JSON of the values that are not nominal
     layout: str = DEFAULT
     arm: int = -1  # index into the twin's `mission_arms`; -1: none was chosen
@@ -97,7 +97,7 @@ class Collector(Stateful):
         strata: FreshStrata | None = None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
-        self.strata = strata  # of the ring's rows; None: their conditions
+        self.strata = strata  # of the ring's rows; None: conditions serve as strata
         self.goal = task.goal != "none"  # whether success is defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
@@ -146,13 +146,13 @@ class Collector(Stateful):
     ) -> Any:
         """Begin a step with one action per environment, (N,), each drawn with `probability` (N,).
 
-        Returns the result of the step, or None if a thread makes it; `finish` adds it to the ring.
+        Returns the step's result, or None if a thread makes it; `finish` adds it to the ring.
         """
         envs = np.arange(self.env.num_envs)
         now = self.env.signals
         for name, history in self._history.items():
             history[envs, self._steps] = now[name]
-        # The command in force during the step that begins, as in a log.
+        # As in a log, a row's command is the one in force during the step that begins there.
         self._history["command_speed_mps"][envs, self._steps] = self._actions[action, 0]
         self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
         if self._executor is not None:
@@ -173,22 +173,22 @@ class Collector(Stateful):
         """Add the result of the step to the ring.
 
         Args:
-            env_steps: of the run before this step.
-            gradient_steps: of the run, now.
+            env_steps: the run's environment steps before this step.
+            gradient_steps: the run's gradient steps so far.
             acting_step: the gradient step of the network that chose the actions.
 
         Returns the episodes that ended.
         """
         if self._sent is None:
             raise RuntimeError("finish() without start()")
-        # Cleared before the result is read: if the teacher failed, no step was made.
+        # Clear both first: reading the result raises if the teacher failed, and no step was made.
         (action, probability), self._sent = self._sent, None
         future, self._future = self._future, None
         result, self._result = future.result() if future is not None else self._result, None
         observation, reward, terminated, truncated, info = result
         ended = np.asarray(terminated | truncated, np.bool_)
         next_observation = np.array(observation, copy=True)
-        for place in np.flatnonzero(ended):  # SAME_STEP: `observation` is the next episode's first
+        for place in np.flatnonzero(ended):  # autoreset: `observation` is the next episode's
             next_observation[place] = info["final_obs"][place]
         keys = self.ring.append(
             observation=self.observation,
@@ -211,7 +211,7 @@ class Collector(Stateful):
         self._steps += 1
         self._return += reward
         self._bumps += bumped & ~self._touching
-        self._touching = bumped.copy()  # others read the step's own array, too
+        self._touching = bumped.copy()  # a copy, because other code reads the step's array
         values = info.get("perturbation_values", _NO_VALUES * self.env.num_envs)
         self.perturbations.note(keys, info["perturbation"], values)
         finished = []
@@ -267,7 +267,7 @@ class Collector(Stateful):
         self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
 
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
-        """Label the ended episodes once enough wait; return rows for the run's table `episodes`."""
+        """Label ended episodes, a number at once; return rows for the run's table `episodes`."""
         waiting = self._unlabelled
         if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
             return []
@@ -280,7 +280,7 @@ class Collector(Stateful):
         codes = np.array([self._codes[name] for name in names] or [], np.int64)
         rows, begin = [], 0
         for episode in waiting:
-            inside = slice(begin, begin + episode.steps)  # no transition begins at the last step
+            inside = slice(begin, begin + episode.steps)  # the last step begins no transition
             begin += episode.steps + 1
             of_steps = codes[inside] if len(codes) else np.zeros(episode.steps, np.int64)
             strata = None
@@ -326,14 +326,14 @@ class Collector(Stateful):
 def conditions_in_twin(
     conditions: Sequence[Condition], signals: Collection[str], *, lidar: bool = True
 ) -> tuple[list[Condition], dict[str, list[str]]]:
-    """Return the conditions that can be evaluated in the twin, and the `signals` the others lack.
+    """Return the conditions that the twin can evaluate, and what `signals` each other one lacks.
 
-    The twin fills Restock's own signals, but none of a profile's `[signals.*]`. Conditions over
-    those label only logs: on fresh episodes they would be guesses. For a robot without a lidar,
-    conditions over its scans are left out, too, as they are null in its logs.
+    The twin fills Restock's own signals, but none of a profile's `[signals.*]`. Conditions over a
+    profile's signals label only logs: on fresh episodes they would be guesses. For a robot without
+    a lidar, conditions over scans are left out, too, because scans are null in its logs.
 
     Raises:
-        ConfigError: a condition does not run for another reason.
+        ConfigError: a condition's SQL fails for another reason than a missing signal.
     """
     steps = steps_schema().empty_table()
     needed: dict[str, list[str]] = {} if lidar else signals_named(conditions)
@@ -349,7 +349,7 @@ def conditions_in_twin(
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:
-    """Return the names that a ring's labels index: by priority, nominal last."""
+    """Return the names of the ring's condition codes, in order: by priority, nominal last."""
     ordered = sorted(conditions, key=lambda condition: (condition.priority, condition.name))
     return [condition.name for condition in ordered] + [NOMINAL]
 
@@ -369,14 +369,14 @@ def steps_table(episodes: Sequence[EndedEpisode]) -> pa.Table:
 
 
 class FreshStrata:
-    """The strata of a mixture, for episodes of the twin.
+    """The strata of a mixture, assigned to the steps of the twin's episodes.
 
     Args:
-        names: of the strata (S,), without a store's name.
+        names: the strata's names (S,), without a store's name.
         conditions: outcomes and exposures that can be evaluated on fresh rows.
 
-    `known` (S,) is whether fresh rows can be in a stratum. They cannot if it is a predicate over
-    the store's columns (`where`), or a condition that cannot be evaluated in the twin.
+    `known` (S,) is whether fresh rows can be in a stratum. They cannot if it is defined by columns
+    of the store (`where`), or by a condition that cannot be evaluated in the twin.
     """
 
     def __init__(
@@ -401,7 +401,7 @@ class FreshStrata:
 
     @classmethod
     def of(cls, panel: Panel, conditions: Sequence[Condition]) -> FreshStrata:
-        """Build it from the mixture of a panel."""
+        """Build the strata from a panel's mixture."""
         header = panel.header
         first = header.strata[: len(header.strata) // (1 + len(header.others))]
         return cls(header.mixture, [stratum.name for stratum in first], conditions)
@@ -410,8 +410,8 @@ class FreshStrata:
         """Return the stratum of each step (T,) of an episode; -1 for a step in none.
 
         Args:
-            labels: (T,) by condition, whether it holds.
-            steps: T.
+            labels: condition -> whether it holds in each step (T,).
+            steps: T, the number of the episode's steps.
             rows: (S,) how many fresh rows each stratum has so far.
         """
         held = [labels[name] for name in self._outcomes if name in labels]

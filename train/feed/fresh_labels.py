@@ -28,13 +28,13 @@ class EpisodeLabels(Stateful):
     def __init__(self) -> None:
         self._keys: list[int] = []
         self._codes: list[NDArray[np.int16]] = []  # (2, T) per episode: conditions and strata
-        self._given_up: list[int] = []  # keys
+        self._given_up: list[int] = []  # keys of episodes that never get labels
 
     def note(self, key: int, codes: NDArray[Any], strata: NDArray[Any] | None = None) -> None:
         """Keep the labels of ended episode `key`.
 
-        `codes[t]` (T,) is the condition of its step t, `strata[t]` its stratum. `strata` None: the
-        same codes.
+        `codes[t]` is the condition of step t, `strata[t]` its stratum; both are (T,). Without
+        `strata`, the conditions serve as strata.
         """
         self._keys.append(int(key))
         both = (codes, codes if strata is None else strata)
@@ -45,7 +45,7 @@ class EpisodeLabels(Stateful):
         self._given_up.append(int(key))
 
     def clear(self) -> None:
-        """Forget the labels: rows drawn from now on have them in the ring."""
+        """Forget the labels; rows that are drawn from now on get theirs from the ring."""
         self._keys, self._codes = [], []
 
     def restored(self) -> None:
@@ -54,7 +54,7 @@ class EpisodeLabels(Stateful):
     def fill(
         self, condition: NDArray[Any], stratum: NDArray[Any], key: Ints, step: NDArray[Any]
     ) -> None:
-        """Fill in conditions and strata of WAITING rows (n,) that have labels by now."""
+        """Fill in conditions and strata (n,) of WAITING rows whose labels are known by now."""
         waiting = np.flatnonzero(condition == WAITING)
         if self._given_up:
             lost = np.isin(key[waiting], self._given_up)
@@ -91,16 +91,16 @@ class FreshPerturbations(Stateful):
 
     def forget(self, kept: NDArray[np.int64]) -> None:
         """Forget episodes without a row: `kept` (n,) are the keys of the ring's rows."""
-        if len(self._of) > len(kept) + 1:  # at most one entry per row is needed
+        if len(self._of) > len(kept) + 1:  # more entries than rows: some have no row
             alive = set(np.unique(kept).tolist())
             self._of = {key: entry for key, entry in self._of.items() if key in alive}
 
     def names(self, keys: NDArray[np.int64]) -> list[str | None]:
-        """Return the name in force in each of these episodes; None if unknown."""
+        """Return the name of each episode's perturbation; None if unknown."""
         return [entry[0] if (entry := self._of.get(key)) else None for key in keys.tolist()]
 
     def values(self, keys: NDArray[np.int64]) -> list[Entries | None]:
-        """Return each episode's values that are not nominal, as entries of a map."""
+        """Return each episode's perturbed values, as (name, value) entries; None if unknown."""
         return [
             values_entries(entry[1]) if (entry := self._of.get(key)) else None
             for key in keys.tolist()
@@ -108,5 +108,5 @@ class FreshPerturbations(Stateful):
 
 
 def values_entries(values: str) -> Entries:
-    """Return a JSON object of numbers as the entries of a map column."""
+    """Return a JSON object of numbers as (name, value) entries, for a column of Arrow maps."""
     return [(field, float(value)) for field, value in json.loads(values).items()]

@@ -81,14 +81,14 @@ class Logs:
     weights: F32 | None  # (n,) importance weights, or None if all are 1
     as_of_ns: int  # reference time of ages in days
     transition_id: Ints  # (n,)
-    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be simulated time
+    stamp_ns: Ints  # (n,) when rows were logged; not when measured, which may be simulated time
     condition: Coded
     behaviour_policy: Coded
     behaviour_version: Coded
     episode: Coded
 
     perturbation: Coded | None = None  # of the twin; null for hardware
-    panel: Panel | None = None  # the panel that they are from
+    panel: Panel | None = None  # the panel that the rows are from
     planned: PlannedDraws = _UNPLANNED  # the draws that the run plans
 
     @classmethod
@@ -101,7 +101,7 @@ class Logs:
     ) -> Logs:
         """Read a panel's rows into memory (memory-mapped if it is larger than 4 GiB).
 
-        `as_of_ns` is the reference time of their ages, when training began; None: the newest row's.
+        Ages of rows are counted up to `as_of_ns`, when training began; None: to the newest row.
         """
         rows = np.asarray(panel.rows)
         if rows.nbytes <= _IN_MEMORY_BYTES:
@@ -140,7 +140,7 @@ class Logs:
         seed: int,
         fresh: Bools | None = None,
     ) -> LoggedSampler:
-        """Make the sampler of the logs: by the mixture of their panel, else by their shares.
+        """Make the sampler of the logged rows: by the panel's mixture, or without one by `shares`.
 
         `fresh` (S,) is whether rows of a ring can be in each stratum; None: there is no ring.
 
@@ -170,23 +170,23 @@ class Logs:
 
 @dataclass(frozen=True)
 class Probe:
-    """Rows (n, W) float32, sorted by condition: condition c has `bounds[c]:bounds[c + 1]`."""
+    """Rows (n, W) float32, sorted by condition: c's rows are `rows[bounds[c] : bounds[c + 1]]`."""
 
     rows: Tensor
     conditions: list[str]
     bounds: list[int]
     source: str  # logs | fresh
-    hash: str  # 16 hex digits of the rows
+    hash: str  # of the rows' bytes, 16 hex digits
 
     @classmethod
     def of_logs(cls, logs: Logs, per_condition: int) -> Probe | None:
-        """Choose the rows of each condition whose hashed transition ids come first."""
+        """Choose logged rows: the `per_condition` rows of each condition with the lowest hashes."""
         codes, names = logs.condition.codes, logs.condition.names
         return cls._choose(codes, names, logs.transition_id, per_condition, logs.rows, "logs")
 
     @classmethod
     def of_ring(cls, ring: FreshRing, per_condition: int) -> Probe | None:
-        """Choose labelled rows of the ring, for a run without logs; they are copied."""
+        """Choose and copy labelled rows of the ring, for a run without logs."""
         count = len(ring)
         codes = ring.by_condition.stratum[:count].astype(np.int32)
         key = (ring.meta["episode"][:count] << 20) | ring.meta["episode_step"][:count]
@@ -220,7 +220,7 @@ class Probe:
         return cls(picked, kept, bounds, source, digest)
 
     def measure(self, learner: Learner) -> tuple[list[dict[str, Any]], float]:
-        """Return rows of the run's table `probe`, one per condition, and the lag over all rows."""
+        """Return rows of the table `probe`, one per condition, and the values' lag in all rows."""
         td, q, slow = learner.td_error(self.rows.to(learner.device))
         action = self.rows[:, -3].long().to(learner.device)
         chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
@@ -242,15 +242,15 @@ class Probe:
 
 
 def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Mix ids (splitmix64), so that the choice depends on ids, not on order."""
+    """Hash ids (splitmix64), so that which rows are chosen does not depend on their order."""
     return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
 
 
 PROBE_ROWS = 64  # rows per condition of a probe, fixed for the whole run
 ROWS = 512  # rows per condition that fidelity is measured on, chosen by hash
 _MIN_ROWS = 50  # conditions with fewer rows are left out
-_SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
-_RIDGE = 1.0  # penalty on standardised features
+_SHRINKAGE = 0.05  # part of the discriminant's covariance that is replaced by the mean variance
+_RIDGE = 1.0  # L2 penalty of the linear model on standardised features
 
 
 class LogFidelity:
@@ -269,12 +269,12 @@ class LogFidelity:
 
     @classmethod
     def of(cls, logs: Logs, observation_size: int) -> LogFidelity | None:
-        """Build it from a run's logs; None if they have no row."""
+        """Measure a run's logs; None if they have no row."""
         rows = Probe.of_logs(logs, ROWS)
         return cls(rows, observation_size) if rows is not None else None
 
     def agreement(self, *fresh: Probe) -> dict[str, float]:
-        """Return the agreement of each condition with the `fresh` steps; empty without two."""
+        """Return each condition's agreement; empty if `fresh` has fewer than two conditions."""
         size = self._observation.shape[1]
         steps: dict[str, list[F64]] = {}
         for probe in fresh:
@@ -294,7 +294,7 @@ class LogFidelity:
         }
 
     def _unexplained_shares(self, next_observation: F64, action: F64) -> dict[str, float]:
-        """Return the unexplained share of variance of `next_observation` (n, D)."""
+        """Return the unexplained share of variance of `next_observation` (n, D), by condition."""
         taken = np.eye(int(action.max()) + 1)[action.astype(np.int64)]
         features = _standardise(np.concatenate([self._observation, taken], axis=1))
         features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
@@ -321,9 +321,9 @@ class LogFidelity:
 
 
 def discriminant(classes: list[F64], rows: F64) -> NDArray[np.int64]:
-    """Return the most likely class of each of `rows` (m, D), (m,), with equal priors.
+    """Return the most likely class (m,) of each of `rows` (m, D), if all have equal priors.
 
-    `classes` are the rows (n_k, D) of each class, whose covariances are taken to be equal.
+    `classes` are rows (n_k, D) of each class. The classes are assumed to have the same covariance.
     """
     means = np.stack([part.mean(axis=0) for part in classes])
     within = [np.cov(part, rowvar=False) for part in classes]

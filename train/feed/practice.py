@@ -37,13 +37,13 @@ from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 FLOOR = 0.05  # least share of an arm under the rule "success"
 WHERE = "practice"
 HALF_LIFE_EPISODES = 20.0  # an episode counts half after so many later ones of its arm
-MAX_CHANGE = 0.1  # of a share per interval
+MAX_CHANGE = 0.1  # largest change of a share per interval
 INTERVAL_STEPS = 1_000  # environment steps after which shares may change
 WARMUP_EPISODES = 5  # episodes of an arm before its own rate is used
 
 
 class Practice(Stateful):
-    """A counter of ended missions by arm, which sets the twin's shares at each interval's end.
+    """A counter of ended missions by arm, which sets the arms' shares at each interval's end.
 
     Raises:
         ConfigError: the rule is "success", but the task has no goal.
@@ -65,7 +65,7 @@ class Practice(Stateful):
     ) -> None:
         """`goal` is whether success is defined."""
         self.config, self._set = config, set_shares
-        # The rule "natural" chooses nothing: ordered missions count as others of their kind.
+        # The rule "natural" needs no arms for ordered missions: they count as their kind's.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)
         count = len(self.arms)
         self.names = [arm.name for arm in self.arms]
@@ -79,11 +79,11 @@ class Practice(Stateful):
                 where=f"{WHERE}.rule",
                 remedy='use "even"',
             )
-        self._episodes, self._failures = np.zeros(count), np.zeros(count)  # fading sums
+        self._episodes, self._failures = np.zeros(count), np.zeros(count)  # older ones count less
         self._seen: Ints = np.zeros(count, np.int64)  # episodes ended so far
         self._interval_episodes: Ints = np.zeros(count, np.int64)
         self._interval_successes: Ints = np.zeros(count, np.int64)
-        self._closed_at = 0  # environment steps
+        self._closed_at = 0  # environment steps when the last interval was closed
         self._fixed = self._fixed_weights()
         self.shares: F64 = (
             self.natural if config.rule == "natural" else with_floor(self.weights, self.floor)
@@ -107,10 +107,10 @@ class Practice(Stateful):
             self._interval_successes[place] += success
 
     def advance(self, steps: Mapping[str, int], *, last: bool = False) -> list[dict[str, Any]]:
-        """Close an interval if it ends: return its rows of `practice`, and set the next shares.
+        """Close the interval if it is over: return its rows of `practice`, and set new shares.
 
-        Return no rows if it does not end. Call this while no step of the twin is under way. `last`
-        closes the open interval, because the run ends here.
+        Return no rows if the interval goes on. Call this while no step of the twin is under way.
+        `last` closes the interval early, because the run ends here.
         """
         env_steps = steps["env_steps"]
         due = env_steps - self._closed_at >= INTERVAL_STEPS
@@ -126,7 +126,7 @@ class Practice(Stateful):
 
     @property
     def weights(self) -> F64:
-        """Return the arms' weights by the rule, before the floor, (K,); not all 0."""
+        """Return the weights (K,) that the rule gives the arms, before the floor; not all are 0."""
         return self.failure_rate if self._fixed is None else self._fixed
 
     @property
@@ -138,7 +138,7 @@ class Practice(Stateful):
     def failure_rate(self) -> F64:
         """Return each arm's failure rate, with Jeffreys' prior, (K,); older episodes count less.
 
-        It is the kind's rate if the arm has too few episodes, and 1 if the kind has too few.
+        An arm with too few episodes has the rate of its kind; if the kind has too few, it is 1.
         """
         kinds = np.unique([arm.kind for arm in self.arms], return_inverse=True)[1]
 
@@ -239,7 +239,7 @@ def with_floor(weights: F64, floor: float) -> F64:
 def moved(shares: F64, wanted: F64, most: float) -> F64:
     """Move `shares` towards `wanted`, none by more than `most`; they still sum to 1.
 
-    All move by the same fraction of their distance, so a floor or a sum that both have is kept.
+    All move by the same fraction of their distance, so a floor under both is a floor of the result.
     """
     farthest = float(np.abs(wanted - shares).max())
     part = 1.0 if farthest <= most else most / farthest
@@ -313,7 +313,7 @@ def make_twin(
     nthread: int = 1,
     layouts: str | None = None,
 ) -> Twin:
-    """Make the twin of a run, on other floors if `layouts` is given; `NoTwin` if it has none."""
+    """Make a run's twin, on other floors if `layouts` is given; `NoTwin` without `env.twin`."""
     if not config.env.twin:
         return NoTwin(profile.task)
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -327,7 +327,7 @@ def make_twin(
         task=profile.task,
         robot=profile.robot,
         layouts=layouts or config.env.layouts,
-        # Only evaluation gives `layouts`, and it drives fixed episodes.
+        # Only evaluation gives `layouts`; it drives fixed episodes, not ordered missions.
         missions=() if layouts is not None else mission_orders(config),
         missions_share=config.env.missions_share,
         nav_command=profile.inputs.nav_command is not None,

@@ -26,17 +26,17 @@ from restock.state import Stateful
 from restock.train.feed.fresh_labels import WAITING, EpisodeLabels, FreshPerturbations
 from restock.train.feed.logs import Coded, Logs
 
-_MAX_CELLS = 1 << 22  # of a dense count; for wider ranges of episodes, rows are sorted instead
+_MAX_CELLS = 1 << 22  # most cells counted in one array; if episode keys span more, rows are sorted
 _BATCH: dict[str, DTypeLike] = {
     **dict.fromkeys(("td", "q", "weight"), "f4"),
     "action": "i2",
     **dict.fromkeys(("reward", "discount"), "f4"),
 }
-LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: of the panel
+LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: in the panel
 GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited log rows
 FRESH: dict[str, DTypeLike] = {
     "condition": "i2",  # WAITING while its episode goes on
-    "stratum": "i2",  # of the mixture; without strata, the condition
+    "stratum": "i2",  # the mixture's stratum; without a mixture, the condition
     "episode": "i8",  # the ring's key
     "episode_step": "i4",
     "policy": "i2",
@@ -46,7 +46,7 @@ FRESH: dict[str, DTypeLike] = {
 }
 
 _OF_RING = ("episode", "episode_step", "behaviour_policy", "env_step", "gradient_step")
-_MIN_ROOM = 1 << 12  # rows
+_MIN_ROOM = 1 << 12  # rows to allocate at least
 
 Columns = dict[str, Any]  # arrays, lists, or scalars that hold for all rows
 Arrays = Mapping[str, NDArray[Any]]  # (n,) each
@@ -78,7 +78,7 @@ class SampledRows(Stateful):
         return self._held, begin
 
     def append(self, *part: NDArray[Any]) -> None:
-        """Append rows (n,), given as columns in their order."""
+        """Append rows, given as one array (n,) per column, in the order of the columns."""
         columns, begin = self.grow(len(part[0]))
         for column, values in zip(columns, part, strict=True):
             column[begin : self._count] = values
@@ -129,9 +129,9 @@ class BatchValues:
 
 def keep_rows(
     values: BatchValues,
-    log_rows: Ints,  # (L,) of the panel
+    log_rows: Ints,  # (L,) row numbers in the panel
     log_stratum: Ints,  # (L,)
-    slots: Ints,  # (B - L,) of the ring
+    slots: Ints,  # (B - L,) slots of the ring
     ring: FreshRing,
     clocks: tuple[int, int],  # environment steps and updates, now
     logged: SampledRows,
@@ -169,15 +169,15 @@ def keep_rows(
 
 
 def episode_sums(
-    episode: NDArray[np.int64],  # (n,) of each row
-    pair: NDArray[np.int64],  # (n,) of stratum and condition
+    episode: NDArray[np.int64],  # (n,) key of each row's episode
+    pair: NDArray[np.int64],  # (n,) code of each row's stratum and condition
     weight: NDArray[np.float32],  # (n,)
     pairs: int,
 ) -> dict[str, NDArray[Any]]:
     """Sum rows by episode and pair, into columns episode, pair, drawn_rows, weight.
 
-    Rows of one episode are drawn together and are alike, so certainty about what a critic was fed
-    depends on the number of episodes, not of rows. `restock compare` resamples episodes.
+    Rows of one episode are drawn together and are alike. Intervals of what a critic was fed depend
+    on the number of episodes, not of rows, so `restock compare` resamples episodes.
     """
     first = int(episode.min(initial=0))
     key = (episode.astype(np.int64) - first) * pairs + pair
@@ -233,7 +233,7 @@ def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64], step: 
 
 def fresh_audit(
     rows: Arrays,
-    slots: NDArray[np.int64],  # (n,) of the ring
+    slots: NDArray[np.int64],  # (n,) the rows' slots in the ring
     ring: FreshRing,
     perturbations: FreshPerturbations | None = None,
 ) -> Columns:
@@ -265,7 +265,7 @@ def add_names(
     """Add names to the columns of `fresh_audit`; rows in no stratum get `unlabelled`."""
     names = [conditions[code] if code >= 0 else None for code in audit["condition"].tolist()]
     of_strata = audit["of_stratum"].tolist()
-    values = audit["perturbation_values"]  # pairs are lists after a checkpoint was loaded
+    values = audit["perturbation_values"]  # of (name, value), which are lists from a checkpoint
     columns = {
         **audit,
         "episode": [str(key) for key in audit["key"].tolist()],
@@ -285,7 +285,7 @@ def _names(coded: Coded, rows: NDArray[np.int64]) -> list[str]:
 
 @dataclass(frozen=True)
 class HeldInterval:
-    """The fresh rows of a closed interval.
+    """The fresh rows of a closed interval, held until all of them have labels.
 
     `rows` are columns (n,) of `FRESH`, `audits` are columns of each audited batch. `open_rows` are
     the rows of the ring that had no condition yet when the interval was closed.
@@ -297,7 +297,7 @@ class HeldInterval:
     available: Ints  # (S,) labelled rows of the ring, by stratum
     open_rows: dict[str, NDArray[Any]]  # condition, stratum, episode, episode_step
     audits: Sequence[dict[str, Any]]  # columns of `audit`, with condition, key and greedy action
-    quotas: Mapping[str, NDArray[Any]] | None = None  # of the batches, as `fed` takes them
+    quotas: Mapping[str, NDArray[Any]] | None = None  # the argument of `fed`
 
     def fill(self, labels: EpisodeLabels) -> None:
         """Fill in the conditions that are known by now."""
@@ -315,8 +315,8 @@ class HeldInterval:
         return any((part["condition"] == WAITING).any() for part in parts)
 
 
-_SHORT = 1e-3  # share of the rows fed; a smaller shortfall is rounding
-_MAX_MARKS = 1 << 25  # span of keys that are marked in place; wider ranges are sorted instead
+_SHORT = 1e-3  # share of all rows fed; a smaller shortfall is taken as rounding
+_MAX_MARKS = 1 << 25  # longest array of marks, one per possible key; beyond it, keys are sorted
 
 
 @dataclass(frozen=True)
@@ -376,7 +376,7 @@ class SourceRows:
 
     @cached_property
     def sums(self) -> dict[str, F64]:
-        """Return sums of the averaged columns by stratum and condition, (S, C)."""
+        """Return the sums (S, C) that means are computed from, by stratum and condition."""
         rows = self.rows
         return {
             "weight": self.summed(rows["weight"]),
@@ -394,9 +394,9 @@ class SourceRows:
 
 
 def first_places(key: Ints) -> Ints:
-    """Return the place of one row for each distinct value of `key` (n,), ordered by value.
+    """Return the index of one row for each distinct value of `key` (n,), ordered by value.
 
-    Keys of rows are dense enough to mark them in place, in a thirtieth of the time of sorting.
+    Keys span few values, so marking each in an array takes a thirtieth of the time of sorting.
     """
     first = int(key.min()) if len(key) else 0
     span = int(key.max(initial=first)) - first + 1
@@ -503,13 +503,13 @@ def conditions(source: SourceRows) -> Columns:
 def actions(source: SourceRows, names: Sequence[str]) -> Columns:
     """Compute the columns of `actions`, including actions that were never drawn.
 
-    `names` (A,) are the task's.
+    `names` (A,) are the names of the task's actions.
     """
     count, size = len(names), len(source.conditions)
     pairs = np.flatnonzero(source.drawn.sum(axis=2).ravel())  # (P,)
 
     def of_task(by_cell: Ints) -> Ints:
-        """Select the pairs that occurred and all actions, (P, A), from (S, C, a) or (S * C, a)."""
+        """Return (P, A) of counts (S, C, a) or (S * C, a): pairs that occurred, all actions."""
         of_pairs = by_cell.reshape(source.pairs, -1)[pairs]
         padding = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
         whole: Ints = np.pad(of_pairs, padding)[:, :count]
@@ -542,7 +542,7 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
 
 def ages(unit: str, age: F64) -> Columns:
     """Compute the columns of `ages`, except the source."""
-    # 2**bucket <= age < 2**(bucket + 1); -1 below 1
+    # Bucket b counts ages from 2**b to below 2**(b + 1); bucket -1 counts ages below 1.
     rows = np.bincount(np.frexp(np.maximum(age, 0.5))[1])
     observed = np.flatnonzero(rows)
     quantiles = np.quantile(age, [0.5, 0.9, 0.99]).tolist()

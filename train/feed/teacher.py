@@ -51,7 +51,7 @@ Label = NDArray[np.int16]
 
 @runtime_checkable
 class Teacher(Protocol):
-    """A driver that returns its actions for N environments without driving them.
+    """A driver that is queried for actions in N environments, but does not drive them.
 
     It may read the environment itself, not only the observation. It is queried once per step, in
     order, and once before training begins. If it has `state_dict` and `load_state_dict`, a resumed
@@ -79,7 +79,7 @@ class OperatorTeacher(Stateful):
         Raises:
             ConfigError: the environment is not the warehouse twin.
         """
-        if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # what it reads
+        if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # read by the operator
             raise ConfigError(
                 f'teacher.source = "operator" needs the warehouse twin, but this is a'
                 f" {type(env).__name__}",
@@ -126,7 +126,7 @@ class CheckedTeacher(Stateful):
         count = len(observation)
         try:
             label = np.asarray(given)
-        except (TypeError, ValueError) as error:  # rows of several lengths, a tensor on a GPU
+        except (TypeError, ValueError) as error:  # rows of unequal length, or a tensor on a GPU
             raise self._refused(
                 f"returned a {type(given).__name__} that is not an array: {first_line(error)}"
             ) from error
@@ -166,7 +166,7 @@ def open_teacher(
 
     Args:
         given: a teacher to use instead of the one that the config names: an object with `act`, or
-            such a function.
+            a function with the same arguments.
 
     Raises:
         ConfigError: there is no such module or name, or it has no `act` and cannot be called.
@@ -227,7 +227,7 @@ def _user_location(called: Any, error: BaseException) -> str:
     libraries = (
         *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
         str(Path(restock.__file__).parent),
-        "<",  # the import system's own
+        "<",  # frames of the import system, as "<frozen ...>"
     )
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(libraries)]
@@ -235,7 +235,7 @@ def _user_location(called: Any, error: BaseException) -> str:
         return f"{own[-1].filename}:{own[-1].lineno}"
     try:
         return f"{inspect.getsourcefile(called)}:{inspect.getsourcelines(called)[1]}"
-    except (TypeError, OSError):  # it has no source
+    except (TypeError, OSError):  # no source file
         return "teacher.source"
 
 
@@ -265,8 +265,8 @@ def _import_teacher(source: str) -> Any:
         sys.path.remove(folder)
 
 
-_MAX_MEASURED = 128  # rows per condition
-_LOGS_SHARE = 0.25  # share of an online batch, if a teacher is queried
+_MAX_MEASURED = 128  # rows per condition that the filter is measured on
+_LOGS_SHARE = 0.25  # logged rows' share of an online batch if a teacher is queried
 
 
 def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
@@ -278,7 +278,7 @@ def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
 def rows_of_successes(
     policy: Coded, episode: Coded, reward: F32, discount: F32, policies: Sequence[str]
 ) -> Bools:
-    """Select the rows (n,) of episodes that reached their goal without any of `policies`.
+    """Select the rows (n,) of episodes that reached their goal and have no row of `policies`.
 
     An episode reached its goal if it was terminated (discount 0) with a reward above 0.
     """
@@ -344,10 +344,10 @@ class Imitation(Stateful):
                     *(logs.behaviour_policy, logs.episode, logs.rows.numpy(), config.policies)
                 )
             self._offline = _WeightedRows.of(logs, every)
-            # Answers in the agent's own states are worth more than other drivers' successes.
+            # If a teacher answers in the agent's own states, others' successes are not used online.
             self._online = _WeightedRows.of(logs, by_teacher) if config.queried else self._offline
         if not len(self._offline.rows):
-            names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown
+            names = None if logs is None else logs.behaviour_policy.names[:-1]  # without "unknown"
             refuse_no_rows(config, names)
         self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
         self._logged = 0  # rows of an online batch
@@ -392,7 +392,7 @@ class Imitation(Stateful):
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
         """Return rows of the run's table `teacher`: the filter's effect by source and condition.
 
-        Each is measured on up to 128 random rows, of those that online batches are drawn from.
+        Each condition is measured on up to 128 random rows that online batches can contain.
         """
         rng = np.random.default_rng([self._seed, 8, learner.gradient_steps])
         groups: dict[tuple[str, str], tuple[F32, Ints]] = {}
@@ -449,8 +449,8 @@ def _measure_filter(learner: Learner, observation: F32, action: Ints) -> Mapping
 def refuse_no_rows(config: TeacherConfig, logged: Sequence[str] | None) -> None:
     """Raise ConfigError if the logs must have rows of the teacher's policies, but have none.
 
-    They must if no teacher is queried in the twin, or if there are logs and `teacher.policies` is
-    not the default.
+    Logs must have such rows if no teacher is queried in the twin, or if `teacher.policies` is not
+    the default and there are logs.
 
     Args:
         logged: names of the logs' behaviour policies; None: there are no logs.
@@ -471,7 +471,7 @@ def refuse_no_rows(config: TeacherConfig, logged: Sequence[str] | None) -> None:
 
 @dataclass(frozen=True)
 class _WeightedRows:
-    """Logged rows (n,) with their cumulative probabilities, by the shares of their strata."""
+    """Logged rows (n,), and cumulative probabilities of a draw that follow the strata's shares."""
 
     rows: Ints
     cumulative: F64

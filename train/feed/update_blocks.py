@@ -31,7 +31,7 @@ from restock.train.dqn.network import averaging_rate
 from restock.train.feed.batches import Batches, LogTerms, ReplayBatch, draw_ahead
 from restock.train.feed.teacher import Imitation
 
-LONGEST = 16  # most updates of a block
+LONGEST = 16  # most updates in a block
 # A batch, its loss, and its rows' action, reward and discount (B, 3); None: read from the batch.
 MadeUpdate = tuple[ReplayBatch, Loss, Tensor | None]
 
@@ -66,7 +66,7 @@ class DeviceTable:
 
 
 class UpdateBlocks:
-    """A learner's updates in blocks; create it after the session is restored."""
+    """A learner's updates in blocks. It copies the ring, so create it after restoring a session."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ class CapturedUpdates:
         learner: the learner whose parameters are updated.
         table: (n, W) float32 on the learner's device; the rows of a block are rows of this table.
         batch_size: B.
-        longest: K, most updates of a block.
+        longest: K, most updates in a block.
         labelled: M, the behaviour network's batch size; 0: it does not learn.
         has_conservative: whether the CQL term may have a weight above 0.
         expert: (n,) bool, rows to which the margin term applies; None: no row.
