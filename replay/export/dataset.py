@@ -28,8 +28,8 @@ from restock.replay.export.trajectory import (
 )
 
 WITH_IMAGES = "lerobot"
-# The HDF5 library crashes if the disk is full when it flushes its caches of metadata and chunks as
-# a file is closed. These caches are smaller than this.
+# Free disk space that an export to HDF5 needs. The HDF5 library flushes its caches when it closes a
+# file, and crashes if the disk is full then. The caches are smaller than this.
 ROOM_BYTES = 64 << 20
 
 
@@ -135,7 +135,7 @@ def _report_progress(
 
 
 def _check_disk_space(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
-    """Pass trajectories on, and raise StoreError before the disk is full."""
+    """Yield the trajectories, and raise StoreError before the disk is full."""
     for trajectory in episodes:
         free = shutil.disk_usage(out.parent).free
         if free < ROOM_BYTES + 2 * trajectory.observations.nbytes:

@@ -21,8 +21,8 @@ from restock.replay.export.trajectory import Trajectory
 from restock.replay.store.frames import CameraFrame, camera_frames, cameras_of
 from restock.replay.store.store import Store
 
-SAMPLES = 100  # pictures per episode for statistics, as in LeRobot
-SMALL_PX = 150  # for statistics, the longer side is subsampled to about this size
+SAMPLES = 100  # pictures per episode from which statistics are computed, as in LeRobot
+SMALL_PX = 150  # pictures are subsampled for statistics, the longer side to about this size
 
 
 @dataclass
@@ -32,7 +32,7 @@ class ImageFeature:
     camera: str
     shape: tuple[int, int] | None = None  # height, width; None before the first picture
     as_recorded: int = 0  # pictures exported byte for byte
-    packed: Counter[str] = field(default_factory=Counter)  # original encoding -> pictures as PNG
+    packed: Counter[str] = field(default_factory=Counter)  # encoding -> pictures re-encoded as PNG
 
     @property
     def name(self) -> str:
@@ -131,7 +131,7 @@ def pictures(
     for feature in features:
         files: dict[int, bytes] = {}
         small: list[NDArray[np.uint8]] = []
-        known: dict[int, tuple[bytes, NDArray[np.uint8] | None]] = {}  # the last frame
+        known: dict[int, tuple[bytes, NDArray[np.uint8] | None]] = {}  # cache of one
         for frame in camera_frames(store, ids, feature.camera):
             if frame.frame_index not in known:
                 known = {frame.frame_index: feature.picture(frame)}

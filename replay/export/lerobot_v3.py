@@ -29,7 +29,7 @@ from restock.replay.export.trajectory import STATE, Counts, Trajectory, fixed_li
 CODEBASE_VERSION = "v3.0"
 TASK = "Drive along the planned route to its goal without touching anything."
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-OWN = "restock."  # prefix of our own columns, which get no statistics
+OWN = "restock."  # prefix of columns that LeRobot does not define; they get no statistics
 PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 FILE = PATTERN.format(chunk_index=0, file_index=0)  # the only file
 
@@ -123,7 +123,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
     """Return an episode's columns, (T,) or (T, k) each."""
     steps = np.arange(len(t))
     last = steps == len(t) - 1
-    chosen = t.carried.get(STATE)  # unknown after the last step, so without `next.`
+    chosen = t.carried.get(STATE)  # the query's state; unknown after the last step: no `next.`
     return {
         STATE: t.observations[:-1] if chosen is None else chosen.astype(np.float32),
         "action": t.actions,

@@ -99,7 +99,7 @@ def write_d3rlpy(
             }
             for name in D3RLPY_COLUMNS:
                 file.create_dataset(f"{name}_{number}", data=values[name])
-            # Not read by d3rlpy: the transition of each step.
+            # The ids of each step's transition; d3rlpy does not read this group.
             group = file.require_group(f"restock/{number}")
             group.attrs.update(
                 {"episode_id": t.episode_id, "first_step": t.first_step, "cut": t.cut}

@@ -45,10 +45,10 @@ class Selection:
     batches: Iterator[pa.RecordBatch]
     task: Task
     continuous: bool
-    command_range: tuple[F64, F64]  # low and high (2,) of the actions
-    provenance: dict[str, Any]  # source of the data set, as JSON values
+    command_range: tuple[F64, F64]  # lowest and highest speed and yaw rate of the actions, (2,)
+    provenance: dict[str, Any]  # where the rows are from, as JSON values
     store: Store  # the store of the rows
-    cameras: tuple[str, ...] = ()  # every row has a frame of each camera
+    cameras: tuple[str, ...] = ()  # exported cameras; every row has a frame of each
     left_out: Mapping[str, int] = field(default_factory=dict)  # reason -> number of rows
     by_name: bool = False  # the query defines STATE, which replaces the task's observation
 
@@ -195,7 +195,7 @@ def _select(
     )
     table = np.asarray(task.actions)
     low, high = table.min(axis=0), table.max(axis=0)
-    if continuous:  # commands may go beyond the actions
+    if continuous:  # logged commands may exceed the range of the task's actions
         low, high = np.minimum(low, facts[3::2]), np.maximum(high, facts[4::2])
     return Selection(
         where=where,
@@ -245,7 +245,7 @@ def _with_frames(
 def _count_lost(
     connection: duckdb.DuckDBPyConnection, text: str, having: str, where: str, what: str = STATE
 ) -> int:
-    """Return how many rows of `text` are not in `having`; raise StoreError if that is all."""
+    """Count the rows of query `text` that query `having` lacks; raise StoreError if it has none."""
     counts = [
         fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]
         for one in (text, having)
@@ -262,7 +262,7 @@ def _count_lost(
 
 
 def _state_sql(columns: Sequence[str], types: Sequence[Any], where: str) -> dict[str, str]:
-    """Return name -> SQL of each number in a query's `observation.state`; {} if it has none.
+    """Return name -> SQL for each number in the query's column `observation.state`, or {}.
 
     Raises:
         QueryError: the column is not a struct of numbers.

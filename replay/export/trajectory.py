@@ -26,11 +26,11 @@ REQUIRED = (
     *("terminated", "truncated"),
 )
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
-CARRIED = (  # exported if the query has them
+CARRIED = (  # optional columns, exported if the query has them
     *("transition_id", "stamp_ns", "condition", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "action_residual", "robot", "site"),
 )
-STATE = "observation.state"  # query column: named numbers to export as the observation
+STATE = "observation.state"  # a query's struct of named numbers, exported as the observation
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Trajectory:
     observations: F32  # (T + 1, D)
     actions: NDArray[Any]  # (T,) int64, or (T, 2) float32: m/s and rad/s
     rewards: F32  # (T,)
-    terminated: bool  # after the last step; else truncated
-    cut: bool  # truncated because the selection lacks the rows after it
+    terminated: bool  # whether the last step terminated the episode; else it is truncated
+    cut: bool  # truncated because the selection lacks the episode's next rows
     carried: dict[str, NDArray[Any]]  # column -> (T,); text has dtype object
 
     def __len__(self) -> int:
@@ -55,21 +55,21 @@ class Trajectory:
 
     @property
     def robot_and_site(self) -> dict[str, str]:
-        """Return its robot and site, if the rows have them; they are the same in all steps."""
+        """Return the robot and site of all steps, if the rows have these columns."""
         first = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
         return {name: "" if value is None else str(value) for name, value in first.items()}
 
 
 @dataclass
 class Counts:
-    """Counts of rows read, and of what they became."""
+    """Counts of the rows that were read, and of the trajectories made from them."""
 
     rows: int = 0
     transitions: int = 0
     trajectories: int = 0
     terminated: int = 0
-    truncated: int = 0  # by the episode's own end
-    cut: int = 0  # because rows are missing
+    truncated: int = 0  # trajectories truncated where the episode was
+    cut: int = 0  # trajectories truncated because rows are missing
     episodes: int = 0
     left_out: Counter[str] = field(default_factory=Counter)  # reason -> number of rows
 
@@ -195,7 +195,7 @@ def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Trajectory
 
 
 def count_episodes(trajectories: Iterable[Trajectory], counts: Counts) -> Iterator[Trajectory]:
-    """Pass trajectories on, and count their episodes (they come episode by episode)."""
+    """Yield the trajectories, which are sorted by episode, and count their episodes."""
     before: str | None = None
     for trajectory in trajectories:
         counts.episodes += trajectory.episode_id != before
