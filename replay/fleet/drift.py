@@ -21,15 +21,15 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of `measure_drift`. Columns of the rows are documented in docs/sql.md."""
+    """The result of `measure_drift`. docs/sql.md documents the columns of its tables."""
 
     store: str
     version: int
-    every: str  # day, week, …
-    reference: int  # number of first periods that form a robot's reference
-    least_episodes: int  # on each side of a comparison
-    findings: Rows  # as the view drift_findings: changes, largest first
-    tests: Rows  # as the view drift: all comparisons
+    every: str  # length of a period: day, week, …
+    reference: int  # number of a robot's first periods that are its reference
+    least_episodes: int  # episodes that each side of a comparison needs
+    findings: Rows  # rows of the view drift_findings: changes, largest first
+    tests: Rows  # rows of the view drift: all comparisons
     periods: Rows  # robot, site, period, part, signal, recordings, episodes, p25, median, p75
     conditions: Rows  # robot, period, condition, driven_h, events, events_per_h
     notes: list[str]  # what could not be compared, and why

@@ -17,26 +17,26 @@ import numpy as np
 from restock.arrays import F64, Ints
 
 REPLICATES = 200
-_SIMULATED = 2000  # largest number of missions to draw one by one
+_SIMULATED = 2000  # up to this number of missions, each is drawn; more are approximated
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """The forecast for one kind of mission and one gap; amounts are missions or hours."""
+    """How many missions or hours of one kind are needed to fill one gap."""
 
-    episodes: int  # episodes from which the rate is estimated
-    seen: int  # number of these with a yield above 0
+    episodes: int  # number of episodes from which the rate is estimated
+    seen: int  # number of these episodes that contributed to the gap
     rate: float  # rows (or episodes) per mission or hour
     rate_low: float  # 95 % interval
     rate_high: float
-    draws: F64  # (R,) amounts needed in R replicates; empty if no episode had a yield
+    draws: F64  # (R,) missions or hours needed in R replicates; empty if `seen` is 0
 
     @property
     def known(self) -> bool:
         return self.seen > 0
 
     def quantile(self, share: float) -> float:
-        """Return the amount that suffices in this share of the replicates; inf without draws."""
+        """Return the missions or hours that suffice in this share of replicates; inf if unknown."""
         return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
 
 
@@ -48,9 +48,10 @@ def forecast(
     rng: np.random.Generator,
     replicates: int = REPLICATES,
 ) -> Forecast:
-    """Forecast the amount for `missing` from the yields `found` (E,) and amounts (E,) of episodes.
+    """Forecast how many missions or hours will yield `missing` more rows (or episodes).
 
-    Episodes with amount 0 (for example of one step) are ignored, and so are those with yield NaN.
+    `found` (E,) is what each past episode yielded, `amount` (E,) its missions (1) or hours.
+    Episodes with amount 0 (for example of one step) or with yield NaN are ignored.
     """
     used = (amount > 0) & ~np.isnan(found)
     found, amount = found[used], amount[used]
@@ -75,7 +76,7 @@ def forecast(
 def _simulate_amount(
     found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
 ) -> float:
-    """Simulate missions in one replicate; return the amount until `missing` is reached."""
+    """Simulate one replicate; return the missions or hours until the yield reaches `missing`."""
     if missing <= 0:
         return 0.0
     mean = float(weights @ found)
@@ -96,9 +97,9 @@ def _simulate_amount(
 def missions_to_see_one(without: int) -> int:
     """Return how many more missions are needed, at least, to see one event with probability 95 %.
 
-    `without` missions have shown none. The largest plausible rate is the exact (Clopper-Pearson)
-    bound, at which `without` missions show none with probability 5 %. At that rate, as many
-    missions again show one with probability 95 %.
+    `without` missions have shown no event so far. The largest plausible rate is the exact
+    (Clopper-Pearson) bound: at that rate, `without` missions show no event with probability 5 %, so
+    that another `without` missions show one with probability 95 %.
     """
     return max(without, 1)
 

@@ -33,20 +33,20 @@ from restock.replay.store.audit import Thresholds, check_thresholds, shipped_aud
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
-MIN_STEPS = 3  # fewer steps with a label may be a mistake
+MIN_STEPS = 3  # steps in which an episode must have a condition; fewer may be a mistake
 CELL = ("condition", "zone", "action", "robot")
 Unit = Literal["missions", "hours"]
 
 
 @dataclass(frozen=True)
 class Yields:
-    """E episodes, and their rows by cell of condition x zone x action x robot."""
+    """E episodes, and the number of rows of each by condition, zone, action and robot."""
 
     episode_id: list[str]  # (E,)
     hours: F64  # (E,)
-    kind: list[str]  # (E,) kind of mission by the condition it met, or nominal
-    simulated: bool  # some recordings have true conditions, so a simulator can drive a chosen kind
-    # Columns: number (of the episode), condition (all that hold, separated by commas), zone,
+    kind: list[str]  # (E,) kind of mission: the condition that the episode met, or nominal
+    simulated: bool  # some recordings are simulated, so that missions of a kind can be ordered
+    # Columns: number (0..E - 1, the episode), condition (all that hold, separated by commas), zone,
     # action, robot, rows.
     cells: pa.Table
 
@@ -54,7 +54,7 @@ class Yields:
         return len(self.episode_id)
 
     def members(self, kind: str | None = None, zone: str | None = None) -> Ints:
-        """Return the episodes of a kind (None: any) that came through a zone (None: any)."""
+        """Return the indices of episodes of a kind that drove through a zone; None: any."""
         chosen = np.ones(len(self), np.bool_)
         if kind is not None:
             chosen &= np.array([one == kind for one in self.kind], np.bool_)
@@ -63,20 +63,20 @@ class Yields:
         return np.flatnonzero(chosen)
 
     def amount(self, unit: Unit, zone: str | None = None) -> F64:
-        """Return the amount of each episode, (E,): one mission, or its hours (in the zone)."""
+        """Return each episode's amount in this unit, (E,): 1 mission, or its hours in the zone."""
         if unit == "missions":
             return np.ones(len(self))
         return self.hours if zone is None else self._hours_in(zone)
 
     def rows_of(self, cell: dict[str, str | int]) -> F64:
-        """Return each episode's rows in a cell, (E,); a field missing from the cell may be any."""
+        """Count each episode's rows in a cell, (E,); columns that it does not name are free."""
         kept = np.ones(len(self.cells), np.bool_)
         for name, value in cell.items():
             kept &= self._matches(name, value)
         return self._sum(kept)
 
     def values(self, name: str) -> list[str | int]:
-        """Return the values that occur of condition, zone, action or robot, sorted."""
+        """Return the sorted values of a column: condition, zone, action or robot."""
         values: list[str | int] = self.cells[name].unique().to_pylist()
         if name == "condition":
             values = [one for held in values for one in str(held).split(",")]
@@ -103,7 +103,7 @@ class Yields:
 
 
 def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
-    """Return the durations of episodes (E,) in hours; the last step counts as long as others."""
+    """Return episode durations (E,) in hours; the last step has the mean length of the others."""
     steps = np.maximum(rows - 1, 1)
     return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
 
@@ -126,14 +126,14 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
 
 
 def reorder(yields: Yields, names: pa.Array, found: F64) -> F64:
-    """Reorder values `found` of episodes `names` to the order of `yields`, (E,); NaN if none."""
+    """Reorder `found`, values of the episodes `names`, like `yields`, (E,); NaN for others."""
     place = {name: index for index, name in enumerate(names.to_pylist())}
     padded = np.append(found, np.nan)
     return padded[[place.get(name, -1) for name in yields.episode_id]]
 
 
 Counted = Literal["rows", "episodes"]
-# Audits whose thresholds give numbers of rows or episodes to reach.
+# Audits whose thresholds are numbers of rows or episodes, which gaps are measured against.
 AUDITS = ("rare_condition", "few_effective_episodes", "missing_cells")
 
 
@@ -141,15 +141,15 @@ AUDITS = ("rare_condition", "few_effective_episodes", "missing_cells")
 class Gap:
     """A cell or stratum with too few rows or episodes."""
 
-    asked_by: str  # "mixture coverage", "audit rare_condition", "--min-rows"
-    cell: dict[str, str | int]  # any of condition (or stratum), zone, action, robot -> value
+    asked_by: str  # what requires it: "mixture coverage", "audit rare_condition", "--min-rows"
+    cell: dict[str, str | int]  # values of some of: condition (or stratum), zone, action, robot
     counted: Counted
     needed: float
     there: float
-    # (E,) contribution of each episode, in rows or episodes; NaN if the mixture admits none of it.
+    # (E,) rows or episodes that each episode adds; NaN if the mixture admits none of its rows.
     found: F64
     action_name: str | None = None  # name of the cell's action; None: no action, or tasks differ
-    thinnest: tuple[str, ...] = ()  # up to three zones furthest below their part of `needed`
+    thinnest: tuple[str, ...] = ()  # up to three zones that lack most of their part of `needed`
 
     @property
     def missing(self) -> float:
@@ -218,7 +218,7 @@ def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
 def uncorrected(mixture: Mixture) -> Mixture:
     """Return the mixture without weights, which are slow to estimate and do not affect gaps.
 
-    The result accepts shortfalls, because they are what is searched.
+    The result accepts shortfalls, because gaps are found from them.
     """
     strata = tuple(msgspec.structs.replace(rule, correction=None) for rule in mixture.strata)
     each = mixture.each_condition
@@ -232,7 +232,7 @@ def uncorrected(mixture: Mixture) -> Mixture:
 
 
 def _without_split(store: Store, mixture: Mixture) -> Mixture:
-    """Return the mixture; without a split by recording if the store has only one recording."""
+    """Remove a split by recording from the mixture if the store has only one recording."""
     if mixture.evaluation_split.by != "recording":
         return mixture
     several = store.sql("SELECT count(DISTINCT recording_id) > 1 FROM transitions").fetchall()[0][0]
@@ -256,7 +256,7 @@ def _find_strata_gaps(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Ga
 
 
 def _rank_zones(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
-    """Return up to three zones whose rows are furthest below `needed` x their share of all rows."""
+    """Return up to three zones that lack most rows of `needed` times their share of all rows."""
     column = plan.rows["zone"].combine_chunks()
     names, zone = column.dictionary.to_pylist(), column.indices.fill_null(len(column.dictionary))
     size = len(names) + 1
@@ -269,14 +269,14 @@ def _rank_zones(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
 def _find_audit_gaps(
     connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
 ) -> list[Gap]:
-    """Return the gaps by the thresholds of AUDITS, including closed ones."""
+    """Return the gaps to the thresholds of AUDITS, including closed ones, which lack nothing."""
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(
         "SELECT condition, rows_held, episodes_held, effective_episodes FROM coverage_by_condition"
     ).fetchall()
     for condition, rows, episodes, effective in lines:
-        if rows is None:  # unknown in all recordings: more drives would not add any
+        if rows is None:  # no recording can show this condition, so more drives would not help
             continue
         found = yields.rows_of({"condition": condition})
         observed = np.asarray(found > 0, np.float64)
@@ -286,8 +286,8 @@ def _find_audit_gaps(
         gaps.append(Gap(by, cell, "rows", requested.get("min_rows", 0), rows, found))
         gaps.append(Gap(by, cell, "episodes", requested.get("min_episodes", 0), episodes, observed))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
-        if effective and effective < least:  # 0: it holds in no row
-            # Assumes that further episodes are as uneven as those in the store.
+        if effective and effective < least:  # 0 if no row has the condition
+            # Assume that rows are spread over new episodes as unevenly as over those in the store.
             needed = math.ceil(least * episodes / effective)
             by = "audit few_effective_episodes"
             gaps.append(Gap(by, cell, "episodes", needed, episodes, observed))
@@ -303,7 +303,7 @@ def _find_audit_gaps(
 def _find_cell_gaps(yields: Yields, conditions: Sequence[Condition], min_rows: int) -> list[Gap]:
     """Return a gap for each cell with fewer than `min_rows` rows, including empty ones.
 
-    A robot's cell counts only that robot's rows, but is forecast from the rows of all robots.
+    A cell with a robot counts only that robot's rows, but its forecast uses rows of all robots.
     """
     gaps = []
     values: dict[str, list[str | int]] = {name: yields.values(name) for name in CELL}

@@ -27,15 +27,15 @@ _REMEDY = "docs/coverage.md lists the keys of a missions file"
 
 
 class MissionOrder(Checked, frozen=True, kw_only=True):
-    """A number of missions of one kind, or hours of logging."""
+    """An order for a number of missions of one kind, or for hours of logging."""
 
     kind: str | None = None  # condition that a mission should meet; None: any
     missions: Annotated[int, Meta(ge=1)] | None = None
-    hours: Annotated[float, Meta(gt=0)] | None = None  # of driving; their duration, if `missions`
+    hours: Annotated[float, Meta(gt=0)] | None = None  # total; with `missions`: their duration
     zone: str | None = None
     robot: str | None = None
     layout: str | None = None
-    fills: tuple[str, ...] = ()  # the gaps that it fills
+    fills: tuple[str, ...] = ()  # descriptions of the gaps that the order fills
 
     def check(self) -> None:
         if self.missions is None and self.hours is None:
@@ -43,7 +43,7 @@ class MissionOrder(Checked, frozen=True, kw_only=True):
 
 
 class MissionsFile(Checked, frozen=True, kw_only=True):
-    """The contents of a missions file: orders, and the store and mixture they are planned for."""
+    """The contents of a missions file: orders, and the store and mixture whose gaps they fill."""
 
     missions: tuple[MissionOrder, ...]
     format: str = FORMAT

@@ -13,7 +13,7 @@ from restock.errors import PanelError, expect
 from restock.replay.panel.panel import Panel
 
 Rows = list[dict[str, Any]]
-# Header fields that are compared separately, or follow from other content.
+# Header fields that are not compared by key: compared separately, or derived from other content.
 _ELSEWHERE = ("id", "files", "strata", "mixture", "task_json", "task_hash")
 SHARES = ("natural_share", "wanted_share", "share", "effective_share")
 
@@ -64,7 +64,7 @@ def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, Any]]:
         for key, item in value.items():
             yield from _flat(item, f"{prefix}.{key}" if prefix else str(key))
     elif isinstance(value, list | tuple) and any(isinstance(item, Mapping) for item in value):
-        # A list of tables: keyed by name, so that an added table does not shift the others.
+        # Key a list of tables by name: an added table then does not shift the keys of the others.
         for place, item in enumerate(value):
             name = item.get("name", place) if isinstance(item, Mapping) else place
             yield from _flat(item, f"{prefix}[{name}]")

@@ -31,7 +31,7 @@ from restock.replay.panel.mixture_tables import install_planned
 from restock.replay.store.audit import load_thresholds
 from restock.replay.store.store import Store
 
-# Columns of `FROM gaps(name)` -> their types.
+# Names and types of the columns of `FROM gaps(name)`.
 COLUMNS = {
     **dict.fromkeys(("asked_by", "stratum", "condition", "zone"), "VARCHAR"),
     "action": "BIGINT",
@@ -41,14 +41,14 @@ COLUMNS = {
     **dict.fromkeys(("rate", "rate_low", "rate_high"), "DOUBLE"),
     **dict.fromkeys(("amount", "amount_low", "amount_high"), "DOUBLE"),
 }
-CONFIDENCE = 0.8  # probability with which the planned amount should close each gap by itself
+CONFIDENCE = 0.8  # probability with which the plan should close each gap
 HOUR_STEPS = 60  # planned hours are rounded up to multiples of 1 / HOUR_STEPS
-_PART = 0.1  # smallest fraction of a gap that an order fills to be listed for it
+_PART = 0.1  # an order is listed for a gap if it fills at least this fraction of the gap
 
 
 @dataclass(frozen=True)
 class Supply:
-    """A kind of mission, or of logging by the hour, that could be ordered."""
+    """Something that can be ordered: missions of a kind, or hours of logging."""
 
     kind: str | None  # None: the fleet's usual operation
     zone: str | None = None  # zone on the route; None: any
@@ -67,20 +67,20 @@ class FilledGap:
     """A gap with the supply that fills it best."""
 
     gap: Gap
-    best: Supply | None  # None: no logged episode contributed to it
+    best: Supply | None  # None: no logged episode contributed to the gap
     forecast: Forecast | None  # forecast of the best supply
-    see_one: tuple[Supply, int] | None  # without `best`: supply, and missions to see one at least
-    closes_with: float | None = None  # probability that the plan closes it
+    see_one: tuple[Supply, int] | None  # without `best`: what to try, and missions to see one row
+    closes_with: float | None = None  # probability that the plan closes the gap
 
 
 @dataclass(frozen=True)
 class Order:
-    """One line of the list."""
+    """One line of the shopping list."""
 
     supply: Supply
-    amount: float  # missions, or hours
+    amount: float  # number of missions, or hours
     hours: float
-    fills: tuple[str, ...]  # the gaps to which it contributes
+    fills: tuple[str, ...]  # descriptions of the gaps to which it contributes
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class ShoppingList:
     unit: Unit
     gaps: list[FilledGap]
     orders: list[Order]
-    total_low: float  # total amount at the 2.5 % quantile of each gap's replicates
-    total_high: float  # total amount at the 97.5 % quantile
+    total_low: float  # missions or hours in all, at the 2.5 % quantile of each gap's replicates
+    total_high: float  # missions or hours in all, at the 97.5 % quantile
 
     @property
     def total(self) -> float:
@@ -104,7 +104,7 @@ def shopping_list(
     *,
     unit: Unit | None = None,
 ) -> ShoppingList:
-    """Plan what fills the gaps, at the rates of the store's episodes.
+    """Plan orders that fill the gaps, if new missions yield as much as the store's episodes.
 
     Args:
         unit: missions of a kind, or hours of logging; None: missions if recordings have true
@@ -121,7 +121,7 @@ def shopping_list(
         amount = yields.amount(unit, supply.zone)[at]
         for index, gap in enumerate(gaps):
             if _may_fill(supply, gap):
-                # The same draws for every gap, so that equal gaps get equal forecasts.
+                # Use the same random draws for every gap, so that equal gaps get equal forecasts.
                 draws = np.random.default_rng(0)
                 table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
     filled = [
@@ -180,10 +180,10 @@ def _minimise_amounts(
     share: float,
     unit: Unit,
 ) -> dict[Supply, float]:
-    """Compute the smallest amounts that fill all reachable gaps.
+    """Compute the smallest amounts (missions or hours) that fill all reachable gaps.
 
-    An amount suffices for a gap if it fills the gap in a fraction `share` of the replicates. One
-    mission counts as missing / amount that suffices, for each gap.
+    An amount suffices for a gap if it fills the gap in a fraction `share` of the replicates. If n
+    missions alone would suffice, one mission counts as filling 1/n of the gap.
     """
     from scipy.optimize import LinearConstraint, milp
 
@@ -198,7 +198,7 @@ def _minimise_amounts(
                 rates[row, column] = gaps[index].missing / max(*enough, 1e-9)
     whole = unit == "missions"
     missing = np.array([gaps[index].missing for index in reachable])
-    scale = np.maximum(missing, 1e-9)  # for gaps of ten rows and of ten thousand in one programme
+    scale = np.maximum(missing, 1e-9)  # the solver needs constraints of similar size
     # On a tie, prefer missions without a required zone or robot, which are easier to arrange.
     cost = [1.001 if supply.zone or supply.robot else 1.0 for supply in supplies]
     found = milp(
@@ -207,7 +207,7 @@ def _minimise_amounts(
         integrality=np.full(len(supplies), int(whole)),
         options={"time_limit": 10.0, "mip_rel_gap": 0.01},
     )
-    if found.x is None:  # should not happen: each gap has a kind that fills it
+    if found.x is None:  # should not happen: some supply fills each reachable gap
         return {}
     amounts = np.round(found.x) if whole else np.ceil(found.x * HOUR_STEPS - 1e-6) / HOUR_STEPS
     return {s: float(a) for s, a in zip(supplies, amounts.tolist(), strict=True) if a > 0}
@@ -216,10 +216,10 @@ def _minimise_amounts(
 def _forecasts(
     table: dict[tuple[int, Supply], Forecast], index: int, supply: Supply
 ) -> list[Forecast]:
-    """Return the forecasts of a supply for a gap, with and without its zone and robot.
+    """Return forecasts for a gap: with the supply's zone and robot, without zone, and without both.
 
-    The caller uses the worst. Of many zones, the one with the luckiest sample looks best. So if a
-    gap has no zone, missions through one zone count no more than missions anywhere.
+    The caller uses the worst one. Otherwise, for a gap without a zone, the zone with the luckiest
+    sample would look best: its missions may count no more than missions anywhere.
     """
     ways = (supply, Supply(supply.kind, None, supply.robot), Supply(supply.kind))
     return [one for way in dict.fromkeys(ways) if (one := table.get((index, way))) is not None]
@@ -342,7 +342,7 @@ def readable(answer: dict[str, Any]) -> tuple[Lines, Lines, Lines]:
         for gap in answer["gaps"]
         if gap["best"]
     ]
-    # Actions never taken in a condition share one row.
+    # All actions that were never taken in a condition share one row.
     groups: dict[tuple[Any, ...], Lines] = {}
     for gap in answer["gaps"]:
         if not gap["best"]:

@@ -74,7 +74,7 @@ def _difference(
     (of_episodes,) = rows_of(connection, "FROM episode_counts")
     return {
         "kind": "store",
-        # A new version alone is not a difference.
+        # Stores that differ only in their version number are not different.
         "different": bool(
             definitions or recordings or labels or of_rows["rows_with_other_changes"]
         ),
