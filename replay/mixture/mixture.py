@@ -34,16 +34,17 @@ Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
 Uncertain = Literal["drop", "keep", "nominal"]
 Within = Annotated[str, Meta(extra_json_schema={"enum": list(RULES)})]  # a key of RULES
-Represents = Literal["natural", "archive"] | dict[str, Fraction]  # or: stratum -> rate of rows
+Represents = Literal["natural", "archive"] | dict[str, Fraction]  # dict: stratum -> share of rows
 
 
 class OtherStore(Checked, frozen=True):
-    """Another store to draw from. It has the mixture's strata, and a share of each batch."""
+    """Another store to draw rows from, with the strata of the mixture and a share of each batch."""
 
-    name: str  # its strata are named `name/stratum`
+    name: str  # prefix of its strata, which are called `name/stratum`
     path: str  # absolute, or relative to the mixture's file; PATH@VERSION for an older version
     share: Fraction  # share of a batch
-    # Rates that its rows represent: their own ("natural"), the main store's ("archive"), or these.
+    # Natural shares that its rows represent: their own ("natural"), the main store's ("archive"),
+    # or given ones.
     represents: Represents | None = None
 
     def check(self) -> None:
@@ -61,7 +62,7 @@ class SourceShares(Checked, frozen=True):
 
     logs: Fraction = 0.5
     stores: tuple[OtherStore, ...] = ()
-    represents: Represents | None = None  # natural rates, if the main store's rows are a selection
+    represents: Represents | None = None  # the same for the main store; never "archive"
 
     def check(self) -> None:
         _check_rates(self.represents)
@@ -87,7 +88,7 @@ class SourceShares(Checked, frozen=True):
         return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
 
     def chosen(self, name: str) -> bool:
-        """Return whether the mixture gives a source other rates than those of its own rows."""
+        """Return whether a source's rows represent other natural shares than their own."""
         return self.represented[name] not in (None, "natural")
 
 
@@ -110,9 +111,9 @@ def _check_within(name: str) -> None:
 
 
 class EvaluationSplit(Checked, frozen=True):
-    """Whole episodes kept out of the panel: `share` of the rows, in groups given by `by`.
+    """Which rows are held out for evaluation: whole groups (`by`), about `share` of the rows.
 
-    If the store has a single episode, or the one episode chosen is more than twice the share, the
+    If the store has a single episode, or a single chosen episode has more than twice the share, the
     end of the longest episode is held out instead, as with "within_episode".
     """
 
@@ -138,27 +139,27 @@ class Safety(Checked, frozen=True):
     """Rows that must not be learned from."""
 
     unsafe: str  # SQL predicate over `transitions`
-    leave_out: Literal["rows", "episodes"] = "rows"  # unsafe rows, or whole episodes with one
+    leave_out: Literal["rows", "episodes"] = "rows"  # "episodes": all rows of episodes with one
 
 
 class CorrectionRule(Checked, frozen=True):
-    """Importance weights that offset the boost of strata, by the timing of their condition."""
+    """Importance weights that offset the boost of strata (drawn share over natural share)."""
 
-    pre: Correction = "none"  # selected by state: a boost does not bias Q
-    post: Correction = "density_ratio"  # selected by outcome: an uncorrected boost biases Q
+    pre: Correction = "none"  # for strata selected by state: their boost does not bias Q
+    post: Correction = "density_ratio"  # for strata selected by outcome: their boost biases Q
     clip: FromOne = 4.0  # largest weight; "clipped" weights are also at least 1 / clip
     # What to do if weights take a stratum's share of the gradient below its share of the rows.
     below_natural: Literal["refuse", "allow"] = "refuse"
 
 
 class StratumLimits(Checked, frozen=True, kw_only=True):
-    """Keys that [[strata]] and [each_condition] share."""
+    """Keys that [[strata]] and [each_condition] have in common."""
 
-    unit: Unit = "step"  # "episode": all rows of episodes that met it; nominal: all other episodes
-    min_steps: AtLeastOne = 1  # with unit "episode": steps of the episode in which it must hold
+    unit: Unit = "step"  # "episode": whole episodes that met the condition; nominal: the others
+    min_steps: AtLeastOne = 1  # with unit "episode": steps in which the condition must hold
     floor: Fraction = 0.0
     cap: Fraction = 1.0
-    correction: Correction | None = None  # default: the mixture's rule for its timing
+    correction: Correction | None = None  # default: `pre` or `post` of the mixture's [correction]
     within: Within | None = None  # default: the mixture's `within`
 
     def check(self) -> None:
@@ -180,8 +181,8 @@ class StratumRule(StratumLimits, frozen=True, kw_only=True):
 
     name: str  # name of a condition or exposure, "nominal", or any name with `where`
     where: str | None = None  # SQL predicate over `transitions`
-    share: Share = "natural"  # share of the rows that a batch takes from its source
-    priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
+    share: Share = "natural"  # share of the rows that its source gives to a batch
+    priority: int | None = None  # default: the condition's, 50 with `where`, or 1000 for nominal
     timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
 
     def check(self) -> None:
@@ -198,7 +199,7 @@ class EachCondition(StratumLimits, frozen=True, kw_only=True):
 
     share: Literal["natural", "equal"] = "natural"
     kind: Literal["outcome", "exposure"] = (
-        "outcome"  # "exposure": strata of situations met, whatever their outcome
+        "outcome"  # "exposure": strata of the store's exposures, which are situations met
     )
 
 
@@ -209,19 +210,19 @@ class Mixture(Checked, frozen=True):
     seed: int = 0
     # How rows are packed.
     discount: Fraction = 0.99  # discount (gamma) per step
-    n_step: AtLeastOne = 1  # steps of a return; stops where the episode or the policy ends
+    n_step: AtLeastOne = 1  # most steps of a return; it ends earlier with the episode or policy
     evaluation_split: EvaluationSplit = EvaluationSplit()
     # Which rows may be drawn.
-    where: str | None = None  # SQL predicate: only these transitions
+    where: str | None = None  # SQL predicate; only transitions that it selects are used
     safety: Safety | None = None
     odometry_as_command: bool = False  # use rows whose action is measured motion
     max_age_days: Annotated[float, Meta(ge=0)] | None = None  # largest age of logged rows
-    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # date for ages; None: now
+    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # ages are relative to it; None: now
     max_age_env_steps: Count | None = None  # largest age of fresh rows
-    max_rows_per_episode: AtLeastOne | None = None  # per stratum
+    max_rows_per_episode: AtLeastOne | None = None  # in each stratum
     max_rows_per_recording: AtLeastOne | None = None
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
-    uncertain: Uncertain = "nominal"  # nominal: uncertain labels do not count; keep: they do
+    uncertain: Uncertain = "nominal"  # labels: "nominal" ignores, "keep" uses them, "drop" the row
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # Shares of strata and sources.
     sources: SourceShares = SourceShares()
@@ -229,7 +230,7 @@ class Mixture(Checked, frozen=True):
     planned_draws: AtLeastOne = 20_000 * 128
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
-    max_replays_per_row: FromOne | None = None  # enforced by the run's learner
+    max_replays_per_row: FromOne | None = None  # largest number of times that a row is drawn
     shortfall: Shortfall = "redistribute"
     # How rows are drawn within a stratum.
     within: Within = "without_replacement"

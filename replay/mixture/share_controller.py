@@ -33,16 +33,16 @@ from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # online batches between two updates of the shares
-_MIN_CHANGE = 0.01  # relative change of a share below which shares are kept
-_MIN_SHORTFALL = 1e-3  # share of all rows fed below which a shortfall counts as rounding
+_MIN_CHANGE = 0.01  # shares are kept if none changes by more than this, relatively
+_MIN_SHORTFALL = 1e-3  # a smaller shortfall (share of all rows fed) is ignored as rounding
 
 
 @dataclass(frozen=True)
 class PlannedDraws:
     """Number of rows that a run will draw: offline, and online over a span of environment steps."""
 
-    offline: float = 0.0  # logged rows only
-    online: float = 0.0  # logged and fresh rows
+    offline: float = 0.0  # rows drawn offline, all logged
+    online: float = 0.0  # rows drawn online, logged and fresh
     begin_env_steps: int = 0
     end_env_steps: int = 0
 
@@ -54,10 +54,10 @@ class SampledStratum:
     name: str
     source: str
     rule: StratumRule
-    rows: int  # in the panel; 0 if it is never drawn
+    rows: int  # number of its rows in the panel; 0 if the stratum is never drawn
     episodes: int
     occurs: float | None = None  # natural share, if its rows are a selection (an archive, a cap)
-    corrected: bool = False  # whether importance weights offset its boost
+    corrected: bool = False  # whether importance weights offset the stratum's boost
 
 
 @dataclass
@@ -71,13 +71,13 @@ class _SourceDraws:
     caps: F64
     offline: float  # planned draws
     online: float
-    got: F64  # current shares of its strata
-    natural: Ints | F64  # "natural" shares are in proportion to it: rows, or natural shares
-    wanted: F64  # shares that the mixture wants
+    got: F64  # current shares of the strata
+    natural: Ints | F64  # rows or natural shares of the strata, up to a constant factor
+    wanted: F64  # shares of the strata that the mixture wants
 
 
 class ShareController(Stateful):
-    """Current shares and draws so far of a panel's strata.
+    """Controls the shares of a panel's strata in a batch, from the draws so far and the plan.
 
     Args:
         mixture: the panel's mixture.
@@ -115,12 +115,12 @@ class ShareController(Stateful):
         self.max_replays = mixture.most_draws  # largest number of draws of one row; None: no limit
         self.fresh, self.online = fresh, False
         size = len(strata) // len(mixture.sources.parts)
-        self._index: Ints = np.arange(len(strata)) % size  # index of each entry's stratum, 0..S - 1
+        self._index: Ints = np.arange(len(strata)) % size  # (K * S,) index of the stratum, 0..S - 1
         self.wanted: F64 = np.zeros(size)
         self.fresh_shares: F64 = np.append(np.zeros(size), 1.0)
         self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in units of a batch
         self.drawn: Ints = np.zeros(len(strata), np.int64)
-        self.batches = 0  # number drawn
+        self.batches = 0  # number of batches drawn
         self.env_steps = 0.0
         self.shares: F64 = np.zeros(len(strata))
         self.logs_share = 0.0
@@ -190,7 +190,7 @@ class ShareController(Stateful):
         return self._compute_shares("redistribute")
 
     def replan(self, planned: PlannedDraws) -> bool:
-        """Plan for other draws from the next batch on; return whether the shares changed."""
+        """Replace the planned draws from the next batch on; return whether the shares changed."""
         self._plan_for(planned)
         return self._compute_shares("redistribute")
 
@@ -205,11 +205,11 @@ class ShareController(Stateful):
         self.drawn += np.bincount(stratum, minlength=len(self.drawn))
 
     def give_up(self) -> bool:
-        """Redistribute shares after a stratum used up its draws; return whether they changed."""
+        """Redistribute shares once a stratum has no draws left; return whether shares changed."""
         return self._compute_shares("redistribute")
 
     def _compute_shares(self, shortfall: Shortfall) -> bool:
-        """Compute the current shares within the draws left; return whether they changed."""
+        """Compute the shares that the remaining draws allow; return whether they changed."""
         if self.online:
             return self._compute_online_shares()
         if self.mixture.shortfall == "shrink" and self.fresh is None:
@@ -235,7 +235,7 @@ class ShareController(Stateful):
         return np.concatenate([self.parts[source.name] * source.wanted for source in self.sources])
 
     def _compute_online_shares(self) -> bool:
-        """Compute shares of logged and fresh rows in an online batch; return if they changed."""
+        """Compute the shares of an online batch, logged and fresh; return whether they changed."""
         logs, fresh, wanted = self._split(self.stock, self._limits())
         self.wanted = wanted
         fresh_shares = np.append(fresh, max(1.0 - logs.sum() - fresh.sum(), 0.0))
@@ -263,7 +263,7 @@ class ShareController(Stateful):
             return logs, np.zeros(len(wanted)), wanted
         rest = np.maximum(wanted - np.bincount(self._index, logs), 0.0)
         fresh = np.minimum(rest * self.boosted, stock)
-        # Logged rows that may be drawn more often replace missing fresh rows.
+        # If fresh rows are missing, draw more logged rows of the stratum, within the limit.
         room = limit - logs
         of_stratum = np.bincount(self._index, room)
         lack = np.minimum(rest - fresh, of_stratum)
@@ -280,8 +280,7 @@ class ShareController(Stateful):
     def boosted(self) -> Bools:
         """Return which strata (S,) draw fresh rows by quota.
 
-        A stratum whose boost importance weights offset does not, because fresh rows have no
-        weights.
+        Strata with importance weights do not: fresh rows have no weights that would offset a boost.
         """
         corrected = np.array([stratum.corrected for stratum in self.strata[: len(self.wanted)]])
         known = np.zeros(len(corrected), np.bool_) if self.fresh is None else self.fresh
@@ -294,12 +293,12 @@ class ShareController(Stateful):
         """
         source = self.sources[0]
         if all(rule.share != "natural" for rule in source.rules):
-            return source.wanted  # does not depend on the rows
+            return source.wanted  # independent of the rows
         have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural
         return wanted_shares(source.rules, have)
 
     def _limits(self, *, from_start: bool = False) -> F64:
-        """Return the largest share of an online batch that each stratum allows, (K * S,)."""
+        """Return the largest share of an online batch that each stratum's rows allow, (K * S,)."""
         rows = np.array([stratum.rows for stratum in self.strata], np.float64)
         if self.max_replays is None:
             return np.where(rows > 0, 1.0, 0.0)
@@ -330,7 +329,7 @@ class ShareController(Stateful):
             limits = self._limits(from_start=True)
             of_logs, of_ring, requested = self._split(np.full(size, np.inf), limits)
             by_stratum = np.bincount(self._index, of_logs)
-            if not self._has_quotas:  # the ring is sampled uniformly and gives what logs do not
+            if not self._has_quotas:  # the ring, sampled uniformly, gives the rest of the batch
                 of_ring = np.maximum(requested - by_stratum, 0.0)
             part = online / total
             logs, fresh, wanted = (
@@ -387,9 +386,9 @@ class ShareController(Stateful):
             )
 
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
-        """Plan a source; return its shares and the fractions of its draws that its rows can fill.
+        """Plan a source; return its shares, and how much of its remaining draws its rows can fill.
 
-        The first fraction is of all its remaining draws, the second of those online.
+        The latter are two fractions: of all remaining draws, and of the remaining online draws.
         """
         wanted, drawn = source.wanted, self.drawn[source.strata]
         ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
@@ -426,9 +425,9 @@ class ShareController(Stateful):
     def _ahead(self, source: _SourceDraws, drawn: float) -> float:
         """Return how many draws of a source remain.
 
-        Only the planned draws of later batches count. Draws that earlier batches missed are lost.
+        Draws that earlier batches could not make are not made up later, and do not count.
         """
-        if self.fresh is not None:  # online, the ring fills in: only offline draws count here
+        if self.fresh is not None:  # `_limits` plans online draws if there is a ring
             return source.offline - drawn
         by_draws = source.offline + source.online - drawn
         begin, end = self.planned.begin_env_steps, self.planned.end_env_steps

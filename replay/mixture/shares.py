@@ -28,9 +28,9 @@ from restock.replay.mixture.mixture import (
     StratumRule,
 )
 
-# Odds ratio of a condition (by episode, one source against the others) from which to warn of a
-# possible archive, and from which to refuse it if at least ARCHIVE_EPISODES episodes met the
-# condition. Not a ratio of frequencies: more than a fifth can never be five times as frequent.
+# Odds ratio of a condition in the episodes of one source to that in the others: from WARNING_ODDS,
+# warn of a possible archive; from ARCHIVE_ODDS, and ARCHIVE_EPISODES episodes with it, refuse the
+# source. A ratio of frequencies would not do: one above a fifth cannot become five times as large.
 WARNING_ODDS, ARCHIVE_ODDS, ARCHIVE_EPISODES = 2.0, 5.0, 5
 Z_99 = 2.576  # half width of a normal distribution's 99 % interval, in standard errors
 
@@ -47,7 +47,7 @@ class Source(Protocol):
 
 
 class Resolved(Protocol):
-    """A stratum's rule, and its correction as resolved."""
+    """A stratum's rule, and the correction that applies to it."""
 
     @property
     def rule(self) -> StratumRule: ...
@@ -58,9 +58,9 @@ class Resolved(Protocol):
 def represented_shares(
     mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source]
 ) -> list[F64 | None]:
-    """Return the natural shares of strata (S,) that each source represents.
+    """Return for each source the natural shares of strata (S,) that its rows represent.
 
-    They are None for a source that represents only its own rows.
+    The entry is None for a source whose rows represent their own shares.
 
     Raises:
         MixtureError: a rate for an unknown stratum, rates below 1 with no other stratum to take
@@ -86,13 +86,13 @@ def represented_shares(
 
 
 def stands_for_others(mixture: Mixture, source: str) -> bool:
-    """Return whether a source's rows in a panel may represent other rates than their own."""
+    """Return whether packed rows of a source may represent other natural shares than their own."""
     capped = mixture.max_rows_per_episode or mixture.max_rows_per_recording
     return mixture.sources.chosen(source) or capped is not None
 
 
 def _given_rates(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
-    """Return natural shares (S,): the given rates, and the rest divided by the others' rows."""
+    """Return natural shares (S,): the given rates; other strata divide the rest by their rows."""
     if unknown := sorted(set(rates) - set(names)):
         raise MixtureError(
             f"source {source!r}: `represents` gives a rate for {', '.join(unknown)}, which is not "
@@ -134,8 +134,8 @@ def look_for_archives(
 ) -> tuple[str, ...]:
     """Return a warning if a condition is far more frequent in one source than in the others.
 
-    If there are several, only the clearest is reported. The check covers sources without
-    `represents`, and compares each with the others that represent their own rates.
+    If there are several such conditions, only the clearest is reported. Each source without
+    `represents` is compared with the other sources that represent their own rates.
 
     Args:
         stated: `represents` of each source.
@@ -183,12 +183,11 @@ def look_for_archives(
 
 
 def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, float, float]:
-    """Return the odds ratio of `mine` to `theirs`, and the ends of its 99 % interval.
+    """Return the odds ratio of a condition in `mine` to `theirs`, with its 99 % interval.
 
-    The confidence level is high because several conditions are compared.
-
-    `mine` and `theirs` are (episodes that met it, episodes). Half an episode is added to each count
-    (Haldane 1956, Anscombe 1956), so that no count is 0.
+    `mine` and `theirs` are (episodes that met the condition, all episodes). Half an episode is
+    added to each count (Haldane 1956, Anscombe 1956), so that no count is 0. The confidence level
+    is high because several conditions are compared.
     """
     counts = np.array([mine[0], mine[1] - mine[0], theirs[0], theirs[1] - theirs[0]]) + 0.5
     log_odds = float(np.log(counts) @ [1, -1, -1, 1])
@@ -200,9 +199,9 @@ def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, f
 class SharePlan:
     """Shares of a batch's logged rows, (S,) each."""
 
-    wanted: F64  # after floors and caps
-    got: F64  # sums to 1
-    scale: float  # fraction of the logged rows of a batch that can be filled
+    wanted: F64  # shares that the mixture wants, within floors and caps
+    got: F64  # shares that the rows allow; they sum to 1
+    scale: float  # fraction of a batch's logged rows that the rows suffice for
     notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
 
 
@@ -254,10 +253,10 @@ def plan_shares(
 def within_limits(
     wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
 ) -> SharePlan:
-    """Limit wanted shares (S,) to what the rows allow, `limit` (S,).
+    """Limit wanted shares (S,) to those that the rows allow, `limit` (S,).
 
-    `caps` (S,) limit the surplus that a stratum takes over from others. `complaints` returns the
-    text for an error: which strata are short.
+    `caps` (S,) are the largest shares that a stratum may reach by taking what others cannot fill.
+    `complaints` returns the text of an error: which strata are short.
 
     Raises:
         MixtureError: a shortfall that the mixture refuses, or no rows at all.
@@ -293,10 +292,10 @@ def within_limits(
 
 
 def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64) -> F64:
-    """Keep given shares, and divide the rest among "equal" and "natural" strata.
+    """Return shares (S,): given ones are kept, "equal" and "natural" strata divide the rest.
 
-    Floors and caps limit the divided shares. "natural" ones are in proportion to `rows` (S,), which
-    may also be natural shares.
+    Floors and caps limit the divided shares. "natural" shares are in proportion to `rows` (S,),
+    which may also be natural shares.
 
     Raises:
         MixtureError: shares that cannot sum to 1 within their floors and caps.
@@ -325,9 +324,9 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64) -> F64:
 
 
 def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints | F64) -> F64:
-    """Return relative sizes: 1 for each flexible stratum, "natural" ones pooled and split by rows.
+    """Return the relative sizes (S,) of "equal" and "natural" strata; 0 for given shares.
 
-    Sizes of strata with a given share are 0.
+    Each stratum adds 1; "natural" strata pool their sizes and divide them by rows.
     """
     natural = np.array([share == "natural" for share in shares], np.bool_)
     parts = flexible.astype(np.float64)
@@ -347,9 +346,9 @@ def rest_within(base: F64, low: F64, high: F64, total: float) -> F64:
 
 
 def scaled_within(base: F64, low: F64, high: F64) -> F64:
-    """Return clip(factor * base, low, high), with the factor found by bisection so it sums to 1.
+    """Return clip(factor * base, low, high), with the factor for which it sums to 1.
 
-    If the entries with a positive base cannot reach 1 even at `high`, the others take the rest.
+    If entries with a positive base sum to less than 1 even at `high`, the others take the rest.
     """
     usable = np.where(base > 0, high, low)
     if usable.sum() < 1.0:
@@ -381,6 +380,6 @@ def missing_rows(mixture: Mixture, rows: Ints, wanted: F64, draws: float) -> Int
     needed = np.ones(len(rows))
     if mixture.most_draws is not None:
         needed = np.maximum(needed, wanted * draws / mixture.most_draws)
-    # The margin keeps rounding errors from adding a row where the rows just suffice.
+    # Subtract a margin: otherwise rounding errors add a row to strata whose rows just suffice.
     missing = np.ceil(np.where(wanted > 0, needed - rows, 0.0) - 1e-6)
     return np.asarray(np.maximum(missing, 0), np.int64)
