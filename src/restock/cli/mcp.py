@@ -74,7 +74,7 @@ class McpCommand:
 def _show_errors(
     tool: Callable[..., dict[str, Any]], error_type: type[Exception]
 ) -> Callable[..., dict[str, Any]]:
-    """Raise a tool's errors as `error_type`, because MCP hides the text of any other type."""
+    """Raise a tool's RestockErrors as `error_type`: MCP hides the text of any other type."""
 
     @wraps(tool)
     def run(*args: Any, **named: Any) -> dict[str, Any]:
