@@ -49,7 +49,7 @@ from restock.ingest.store.version import FORMAT, expect_writable
 from restock.ingest.task.schema import recording_schema
 
 GROUP_ROWS = 65_536  # rows per row group of a joined file
-GROUP_BYTES = 64 << 20  # bytes that end a row group earlier if rows are large, as manifests are
+GROUP_BYTES = 64 << 20  # a row group also ends at this size: manifests have large rows
 READ_ROWS = 2048
 
 
@@ -97,12 +97,12 @@ def merge(
     extra: Sequence[pa.Table] = (),
     summarised: bool = False,
 ) -> AddedFile:
-    """Write one file with the `kept` ingests of these files, in order, after `extra` manifests.
+    """Write a file with the manifests `extra`, then the `kept` ingests of these files, in order.
 
-    The new file's metadata lists its ingests if manifests describe its rows: Restock wrote all the
-    files, or new summaries were made of all rows that others changed (`summarised`). Columns of
-    `schema` that a file lacks are null. One row group at a time is in memory. If writing fails, the
-    new file is deleted.
+    The new file's metadata lists its ingests only if manifests describe all rows: Restock wrote all
+    the files, or it made new summaries of the rows that other tools changed (`summarised`). Columns
+    of `schema` that a file lacks are null. One row group at a time is in memory. If writing fails,
+    the new file is deleted.
 
     Raises:
         StoreError: a file is missing or damaged, or the new file cannot be written.
@@ -212,7 +212,7 @@ def _float_columns(schema: pa.Schema) -> list[str]:
     return paths
 
 
-ATTEMPTS = 12  # at a commit if other writers are faster; in each, Delta's library tries 15 times
+ATTEMPTS = 12  # maximum, if other writers commit first; in each, Delta's library tries 15 times
 CHECKPOINT_COMMITS = 20  # commits per checkpoint, so that readers of the log open few files
 _JITTER = random.SystemRandom()
 T = TypeVar("T")
@@ -265,10 +265,10 @@ class TableCommits(StoreReader):
     def commit(
         self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]
     ) -> tuple[int, list[str]]:
-        """Add files, all or nothing; in `transitions`, also remove older rows of their recordings.
+        """Add files in one commit, which in `transitions` also removes their recordings' old rows.
 
         `instead_of` maps recordings to ingests that must still be the newest in the store. Returns
-        the table's version, and the own paths of the ingests that were removed.
+        the table's version, and the `own_path` of each ingest that was removed.
         """
         recordings = sorted({file.recording_id for file in added})
         replaced: list[str] = []
@@ -284,12 +284,12 @@ class TableCommits(StoreReader):
             actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
             locks = []
             if name == TRANSITIONS:
-                self.discard_uncommitted(name, rewritten)  # of an earlier attempt
+                self.discard_uncommitted(name, rewritten)  # files of an earlier attempt
                 replaced[:] = _own_paths(active, recordings)
                 rewritten.clear()
                 actions += self._removing_actions(active, recordings, rewritten, now_ms)
-                # Two concurrent first ingests of one recording remove nothing, so Delta would not
-                # see a conflict: the transaction id makes it one.
+                # Two concurrent first ingests of one recording remove nothing: only the transaction
+                # id, which both use, makes Delta report a conflict.
                 locks = _make_locks(table, recordings)
             self.transact(table, actions, locks)
             return self._read_own_commit(name, table)
@@ -305,8 +305,8 @@ class TableCommits(StoreReader):
         Returns the last version of the table that has them, and the new version without them.
 
         Raises:
-            StoreError: one was ingested again or removed in the meantime, or other writers were
-                faster too many times.
+            StoreError: a recording was ingested again or removed in the meantime, or other writers
+                were faster too many times.
         """
         rewritten: list[AddedFile] = []
         before: list[int] = []
@@ -314,7 +314,7 @@ class TableCommits(StoreReader):
         def attempt() -> int:
             listing = self._listing(TRANSITIONS)
             table, active = listing.table, listing.files
-            self.discard_uncommitted(TRANSITIONS, rewritten)  # of an earlier attempt
+            self.discard_uncommitted(TRANSITIONS, rewritten)  # files of an earlier attempt
             rewritten.clear()
             if before and not _own_paths(active, ingests):
                 return table.version()  # an earlier attempt was committed, but its answer was lost
@@ -392,9 +392,9 @@ class TableCommits(StoreReader):
             raise
 
     def discard_uncommitted(self, name: str, files: Sequence[AddedFile]) -> None:
-        """Delete the files that are not in the table, if possible.
+        """Delete those of the files that are not in the table, if possible.
 
-        They may be in it: an error or an interrupt can come right after a successful commit.
+        Some may be in the table: an error or interrupt can come right after a successful commit.
         """
         with suppress(OSError, StoreError, DeltaError):
             if files:
@@ -403,7 +403,7 @@ class TableCommits(StoreReader):
                 self.path.delete(f"{name}/{path}" for path in paths)
 
     def remove(self, name: str, paths: Collection[str]) -> None:
-        """Remove those of the files from a table that are still in it."""
+        """Remove files from a table; skip files that are no longer in it."""
 
         def attempt() -> None:
             listing = self._listing(name)
@@ -453,7 +453,7 @@ class TableCommits(StoreReader):
             raise unwritten(self.path, error) from error
 
     def _expect_unchanged(self, instead_of: Mapping[str, str]) -> None:
-        """Check that the store still has these ingests (recording -> ingest)."""
+        """Check that these ingests (recording -> ingest) are still the newest in the store."""
         if not instead_of:
             return
         shown = {one.recording_id: one.ingest_id for one in self.shown()}
@@ -466,7 +466,7 @@ class TableCommits(StoreReader):
                 )
 
     def retry_on_conflict(self, work: Callable[[], T]) -> T:
-        """Run `work`, which reads the table anew, up to ATTEMPTS times while others are faster."""
+        """Run `work`, which reads the table anew, up to ATTEMPTS times if others commit first."""
         for attempt in range(ATTEMPTS):
             try:
                 with self.path.translate_errors():
@@ -485,7 +485,7 @@ class TableCommits(StoreReader):
 
 
 def _own_paths(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
-    """Return the own paths of these recordings' ingests in the files."""
+    """Return the `own_path` of each ingest of these recordings in the files."""
     return [
         own_path(one.recording_id, one.ingest_id)
         for file in active
@@ -503,7 +503,7 @@ def _make_locks(table: DeltaTable, recordings: Sequence[str]) -> list[Transactio
 
 
 def recording_columns() -> pa.Schema:
-    """Return the columns of `recordings`: the manifest's, and the summary's."""
+    """Return the columns of the table `recordings`: those of the manifest and of the summary."""
     return pa.schema([*recording_schema(), *SUMMARY_SCHEMA])
 
 
@@ -520,7 +520,7 @@ def delta_columns(schema: pa.Schema) -> pa.Schema:
 
 
 def plain_lists(rows: pa.Table) -> pa.Table:
-    """Return the rows with `delta_columns`, without copying the values of lists."""
+    """Convert fixed-size lists in rows to plain lists, without copying the values."""
     schema = delta_columns(rows.schema).with_metadata(rows.schema.metadata)
     columns = []
     for field, column in zip(schema, rows.columns, strict=True):

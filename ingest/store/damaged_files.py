@@ -56,7 +56,7 @@ class LostRecording:
     recording_id: str
     source_file: str
     transitions: int
-    corrections: int | None  # label corrections by people; None if its manifest was damaged
+    corrections: int | None  # number of label corrections by people; None if the manifest is lost
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class DamagedFile:
 
 @dataclass(frozen=True)
 class Verified:
-    """The number of files in a store, and the damaged ones."""
+    """Result of reading all files of a store: their number, and the damaged ones."""
 
     files: int
     damaged: list[DamagedFile]
@@ -105,7 +105,7 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
         for path in damaged:
             sources = _sources(store.path, name, path, rows[path], readable)
             if not dry_run and not _replace(store, name, path, sources):
-                continue  # another process was faster
+                continue  # another process has replaced or removed the file
             if sources:
                 done.joined_again.append(f"{name}/{path}")
                 readable[name] += sources
@@ -160,7 +160,7 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
         for path in unread:
             known.pop(path, None)
         known |= {path: stamps[path] for path in unread if path in stamps and path not in damaged}
-        with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # may be read-only
+        with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # if not read-only
             out.write(json.dumps(known).encode())
     return damaged
 
@@ -235,10 +235,10 @@ def is_damaged(place: Location, path: str) -> bool:
 
 
 def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
-    """Return the files that a damaged file was joined from, reduced to the ingests to restore.
+    """Return the files that a damaged file was joined from, each with only the ingests to restore.
 
-    The list is empty if one of them is gone or damaged, or if they lack some of the file's rows. It
-    is empty for a file of one ingest: the files that its commit removed had what it replaced.
+    The list is empty if a source is gone or damaged, or if the sources lack rows of the file. It is
+    also empty for a file that one ingest wrote: its commit removed only rows that it replaced.
     """
     if OWN_PATH.fullmatch(path):
         return []
@@ -246,7 +246,7 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
     if any(is_damaged(place, one) for one in _in_table(name, paths)):
         return []
     there = [one for file in readable[TRANSITIONS] for one in file.ingests]
-    known = {one.recording_id for one in there}  # also those that were ingested again since
+    known = {one.recording_id for one in there}  # have rows, maybe of a newer ingest
     reported = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
     unlisted = {one.ingest_id for one in there} - reported
     found = []
@@ -286,15 +286,15 @@ def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredF
         made.append(merge(store.path, name, sources, kept, schema))
     replaced = store.replace_files(name, {path}, made, OPERATION) is not None
     if replaced and name == RECORDINGS and OWN_PATH.fullmatch(path):
-        store.path.delete([f"{name}/{path}"])  # readers look up manifests by this path, too
+        store.path.delete([f"{name}/{path}"])  # or readers would find it by its path
     return replaced
 
 
 def _find_lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
     """Return the recordings that have rows but no manifest, or a manifest but no rows.
 
-    A manifest without rows may also be from a writer between its two commits: ingesting its
-    recording again does no harm.
+    A manifest also has no rows while its writer is between two commits. Its recording may then be
+    returned, too: ingesting it again does no harm.
     """
     manifests: dict[str, dict[str, Any]] = {}
     for file in readable[RECORDINGS] if dropped else ():

@@ -32,7 +32,7 @@ from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/([^/]+)\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a joined file
-READERS = 16  # small files read in parallel, as each is a wait on S3
+READERS = 16  # small files to read in parallel, because on S3 each read waits for the server
 _COLUMNS = ("recording_id", "ingest_id")
 
 
@@ -52,11 +52,11 @@ class StoredFile(NamedTuple):
     bytes: int
     added_ms: int
     ingests: tuple[Ingest, ...]
-    listed: bool = True  # whether Restock wrote it: its name or its metadata give the ingests
+    listed: bool = True  # False: another tool wrote it, so its ingests were read from its rows
 
     @property
     def own(self) -> bool:
-        """Return whether it is the unchanged file of one ingest, named after that ingest."""
+        """Return whether this is the unchanged file of one ingest, named after that ingest."""
         return OWN_PATH.fullmatch(self.path) is not None
 
 
@@ -100,10 +100,10 @@ def stored_files(
 
 
 def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -> dict[str, int]:
-    """Count the rows of each ingest whose manifest may no longer describe them.
+    """Count rows per ingest, for ingests whose manifest may no longer describe their rows.
 
-    This is so if another tool wrote one of their files, or if their number differs from `written`,
-    the manifests' numbers of rows by ingest.
+    Such an ingest has rows in a file by another tool, or has not as many rows as in `written`,
+    which maps ingest ids to the numbers of rows in the manifests.
     """
     rows: Counter[str] = Counter()
     others: set[str] = set()
@@ -137,7 +137,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
 
 
 def read_stored_file(place: Location, name: str, path: str) -> StoredFile:
-    """Read which ingests a file of a table has, active or not. Raises as `stored_files`."""
+    """Read which ingests an active or removed file of a table has. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
         rows = open_parquet(source).metadata.num_rows
     if own := _parse_own_path(path, rows):
@@ -167,7 +167,7 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
 def is_system_error(error: BaseException) -> bool:
     """Return whether a file could not be read because of its permissions or the disk.
 
-    Errors of Parquet's reader have no errno. Errors of S3 have become a StoreError before.
+    Errors of Parquet's reader have no errno. Errors of S3 were turned into a StoreError before.
     """
     return (
         isinstance(error, OSError)
@@ -203,14 +203,14 @@ def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
 
 
 def _parse_own_path(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
-    """Return the ingest that a file's name gives; None if it gives none or `rows` is unknown."""
+    """Parse the ingest in a file's name; return None if there is none or `rows` is unknown."""
     ids = OWN_PATH.fullmatch(path)
     return (Ingest(ids[1], ids[2], rows),) if ids and rows is not None else None
 
 
 @lru_cache(maxsize=4096)  # files never change
 def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bool]:
-    """Read which ingests a file has, and whether they are from a list by Restock."""
+    """Read which ingests a file has, and whether Restock listed them in the file's metadata."""
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
         file = open_parquet(source)
@@ -324,7 +324,7 @@ class StoreReader:
         return next(iter(rows.slice(row, 1).to_pylist(maps_as_pydicts="strict")), None)
 
     def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
-        """Return the manifests of ingests with these columns.
+        """Return the columns in `schema` of the manifests of these ingests.
 
         An ingest whose manifest is no longer in the store is left out.
 
@@ -347,7 +347,7 @@ class StoreReader:
         *,
         skip: tuple[type[Exception], ...] = (),
     ) -> Iterator[pa.Table]:
-        """Yield each file that has manifests of these ingests, with these columns and all its rows.
+        """Yield all rows of each file with a manifest of these ingests, in the columns of `schema`.
 
         A file whose reading raises one of `skip` yields no rows.
         """
@@ -373,14 +373,14 @@ class StoreReader:
         """Return one recording's transitions as they were written.
 
         Raises:
-            FileNotFoundError: there are none of this ingest.
+            FileNotFoundError: the store has no rows of this ingest.
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
         import pyarrow.compute as pc  # slow to import
 
         own = own_path(recording_id, ingest_id)
         files = self._listing(TRANSITIONS).paths.get(ingest_id, []) if self._exists() else []
-        if files in ([], [own]):  # replaced and uncommitted rows are at the own path, too
+        if files in ([], [own]):  # []: replaced or uncommitted rows, whose file may exist
             with damage_named(self.path, f"{TRANSITIONS}/{own}"), suppress(FileNotFoundError):
                 return self.path.read(f"{TRANSITIONS}/{own}")
         parts = []
@@ -428,7 +428,7 @@ class StoreReader:
         known = self._listings.get(name)
         if known is None or self.path.has_new_commits(name, known.table):
             return self._update_listing(name, self.path.open_table(name))
-        if known.at[1] != known.table.version():  # after a commit by this store itself
+        if known.at[1] != known.table.version():  # changed by `_read_own_commit`
             return self._update_listing(name, known.table)
         return known
 
@@ -445,7 +445,7 @@ class StoreReader:
         """Update a table after a commit by this store, and return its new version."""
         before = table.version()
         table.update_incremental()
-        if table.version() != before + 1:  # reopen the table, which checks commits of others
+        if table.version() != before + 1:  # others committed, too: reopen, to check their commits
             self._listings.pop(name, None)
         return table.version()
 

@@ -116,7 +116,7 @@ class Location:
                 remedy="give a folder, or s3://bucket/prefix",
             )
         if _ENCODED.search(text if on_s3 else str(Path(text).absolute())):
-            # Delta's library would decode it as a character, and read another path.
+            # Delta's library would decode `%20` to a space, and read another path.
             raise StoreError(
                 "the path of a store cannot contain a percent sign followed by two hex digits",
                 where=text,
@@ -170,7 +170,7 @@ class Location:
     def expect_both_tables(self) -> None:
         """Check that neither of the two tables is missing while the other exists.
 
-        A first ingest that was killed may leave `recordings` alone, without files. That is allowed:
+        A first ingest that was killed may leave only `recordings`, without files. That is allowed:
         a writer makes `recordings` first, and adds manifests when it has made both tables.
 
         Raises:
@@ -182,7 +182,7 @@ class Location:
             gone, other = TRANSITIONS, RECORDINGS
         else:
             return
-        if not self.has_table(gone):  # checked last, as another writer may be making it
+        if not self.has_table(gone):  # looked up last: a writer may just have made it
             raise StoreError(
                 f"its table `{gone}` is missing, while `{other}` is there",
                 where=self.text,
@@ -191,7 +191,7 @@ class Location:
             )
 
     def other(self) -> str | None:
-        """Return "a panel" or "the folder of a run" if the folder is one, else None."""
+        """Return "a panel" or "the folder of a run" if the store's path is one, else None."""
         for file, kind in _OTHERS.items():
             if self.folder is not None and (self.folder / file).is_file():
                 return kind
@@ -214,11 +214,11 @@ class Location:
         return f"`restock ingest RECORDINGS --store {quoted(self.text)}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
-        """Open a table at a version (None: the newest), or as it was at a moment.
+        """Open a table at a version's number, at a time, or by default at its newest version.
 
         Raises:
-            StoreError: there is no such table or version, its format is another, it has a feature
-                that Restock cannot read, its log is damaged, or the place cannot be reached.
+            StoreError: there is no such table or version, it has another format or a feature that
+                Restock cannot read, its log is damaged, or the place cannot be reached.
         """
         try:
             with self.translate_errors():
@@ -232,7 +232,7 @@ class Location:
                             f"has no version {version}: its newest is {newest}", where=self.text
                         )
                     table.load_as_version(version)
-                if self.folder is not None:  # a disk may keep part of a commit; S3 does not
+                if self.folder is not None:  # disks can hold half a commit, S3 cannot
                     expect_whole(self.folder / name / LOG, table.version(), where=self.text)
                 expect_format(table, where=self.text)
                 expect_readable(table, where=self.text)
@@ -252,7 +252,7 @@ class Location:
     def has_new_commits(self, name: str, table: DeltaTable) -> bool:
         """Return whether a table that was read has newer commits, or was replaced meanwhile."""
         version = table.version()
-        if self.folder is not None:  # looking for the next commit's file takes a hundredth
+        if self.folder is not None:  # to look for the next commit's file is 100 times faster
             current, following = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
             return (self.folder / following).exists() or not (self.folder / current).exists()
         with self.translate_errors():
@@ -311,11 +311,11 @@ class Location:
 
         String views, which other tools write, are cast to strings.
 
-        `columns` the file lacks are left out. With a filter `where`, all columns are read. Text of
-        `repeated` columns is read as Arrow dictionaries, with each text in memory once.
+        Those of `columns` that the file lacks are left out. With a filter `where`, all columns are
+        read. `repeated` text columns become Arrow dictionaries, with each text in memory once.
 
         Raises:
-            FileNotFoundError: it does not exist.
+            FileNotFoundError: the file does not exist.
             StoreError: the place cannot be reached.
         """
         with self.reading(path) as file:
@@ -340,7 +340,7 @@ class Location:
         """
 
         def is_requested(leaf: str) -> bool:
-            # The path parts between a list and its field have other names with each writer.
+            # The parts of the path between a list and its field depend on the file's writer.
             names = leaf.split(".")
             return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
 

@@ -201,7 +201,7 @@ def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 
 def score_columns(scores: Sequence[LabelScore]) -> dict[str, Any]:
-    """Return a manifest's columns of scores, and of the counts, which can be added up."""
+    """Return a manifest's columns of label scores, and of their counts, which can be added up."""
     return {"label_scores": score_rows(scores), "label_counts": [asdict(one) for one in scores]}
 
 
@@ -221,12 +221,12 @@ class Correction:
     """A person's verdict that a condition holds, or not, on a stretch of an episode."""
 
     condition: str
-    value: bool  # whether it holds there
-    episode_index: int  # when it was given; needed if a clock was set back, so that times repeat
-    first_ns: int  # log time of its first step
-    last_ns: int  # log time of its last step
+    value: bool  # whether the condition holds there
+    episode_index: int  # at `given_at`; needed as log times repeat if a clock was set back
+    first_ns: int  # log time of the stretch's first step
+    last_ns: int  # log time of the stretch's last step
     given_at: dt.datetime
-    rows: int = 0  # rows that it changes or confirms now
+    rows: int = 0  # number of the recording's rows that the correction covers now
 
 
 @dataclass(frozen=True)
@@ -238,14 +238,14 @@ class Moments:
 
     @classmethod
     def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
-        """Read them from rows; `clock_offset_ns` (manifest) is log time minus alignment clock."""
+        """Read moments from rows; the manifest's `clock_offset_ns` is log time minus `stamp_ns`."""
         logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
         if not rows["logged_ns"].null_count:
             logged = rows["logged_ns"].to_numpy()
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:
-        """Return which rows (N,) are in a correction's interval and episode, else its interval."""
+        """Return which rows (N,) of a correction's episode (or else of any) are in its interval."""
         inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
         same = inside & (self.episode_index == correction.episode_index)
         return np.asarray(same if same.any() else inside, np.bool_)
@@ -263,7 +263,7 @@ def corrections_in(manifest: Mapping[str, Any]) -> list[Correction]:
 
 
 def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
-    """Return the labels' version for these rules and corrections."""
+    """Return the version of labels made by rules (of version `rules`) and these corrections."""
     if not corrections:
         return rules
     content = sorted(
@@ -274,7 +274,7 @@ def corrected_version(rules: str, corrections: Sequence[Correction]) -> str:
 
 
 def rules_of(version: str) -> str:
-    """Return the rules' part of a labels' version."""
+    """Return the part of a labels' version that names the rules."""
     return version.partition("+")[0]
 
 
@@ -311,7 +311,7 @@ def correct_labels(
     Return the rows, and the corrections with the number of rows that each covers now.
 
     A correction covers no rows if its condition is not among `conditions`, or if its stretch has no
-    rows any more. It then changes nothing, and is kept.
+    rows any more. Such a correction is kept, but changes nothing.
     """
     moments, known = Moments.of(rows, clock_offset_ns), [c.name for c in conditions]
     verdicts: dict[str, Ints] = {}  # condition -> (N,) 1: it holds, 0: it does not, -1: no verdict
@@ -364,7 +364,7 @@ def _set_certain(probabilities: pa.MapArray, verdicts: Mapping[str, Ints]) -> pa
     return made.cast(probabilities.type)
 
 
-GOOD = 0.8  # precision and recall from which a label is trusted
+GOOD = 0.8  # least precision and recall of a label that can be trusted
 TOLERANCE_S = 0.4  # distance in time up to which an event and a step match
 
 
@@ -376,20 +376,20 @@ class LabelScore:
     known: int  # transitions whose truth is known
     labelled: int  # transitions with the label
     support: int  # transitions where the condition is true
-    agreed: int  # transitions where it is true, with the label
-    event_labelled: int  # events of the label
-    event_right: int  # events of the label near a true step
-    event_support: int  # true events
-    event_found: int  # true events near a labelled step
+    agreed: int  # transitions with the label where the condition is true
+    event_labelled: int  # events (runs of steps) with the label
+    event_right: int  # events with the label that are near a true step
+    event_support: int  # events of the true condition
+    event_found: int  # events of the true condition that are near a labelled step
 
     @property
     def precision(self) -> float | None:
-        """Return the share of labelled transitions where it is true; None if none is labelled."""
+        """Return the share of labels that are true; None if no transition is labelled."""
         return _share(self.agreed, self.labelled)
 
     @property
     def recall(self) -> float | None:
-        """Return the share of true transitions that are labelled; None if it is never true."""
+        """Return the share of `support` that is labelled; None if the condition is never true."""
         return _share(self.agreed, self.support)
 
     @property
@@ -404,7 +404,7 @@ class LabelScore:
 
     @property
     def shortfall(self) -> str:
-        """Describe how far precision or recall are below GOOD, and how often it is true, or ""."""
+        """Describe how far precision or recall are below GOOD, and the condition's rate; or ""."""
         short = [
             f"{name} {GOOD - value:.2f} short of {GOOD}"
             for name, value in (("precision", self.precision), ("recall", self.recall))
@@ -429,7 +429,7 @@ def score(
 ) -> list[LabelScore]:
     """Score labels (N,) by name against the true conditions of each transition (N,).
 
-    A text of `truth` may name several conditions, separated by commas; None is unknown. Transitions
+    An entry of `truth` names conditions, separated by commas, or is None if unknown. Transitions
     are in order of their episode (N,) and step (N,), `period_s` apart. A label that is never given
     and never true is left out. If no truth is known, there are no scores.
     """

@@ -19,7 +19,7 @@ from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock store remove"
 ID_DIGITS = 16
-PREFIX_DIGITS = 6  # digits of an id that a name needs at least
+PREFIX_DIGITS = 6  # least number of an id's first digits that can name a recording
 _MAX_NAMED = 5
 _HEX = re.compile(rf"[0-9a-f]{{1,{ID_DIGITS}}}")
 
@@ -29,10 +29,10 @@ class RemovedRecording:
     """A recording that was removed from a store, or would be."""
 
     recording_id: str
-    source_file: str  # as it was ingested
+    source_file: str  # path that the recording was ingested from
     transitions: int
     episodes: int
-    corrections: int  # label corrections by people, which another ingest does not bring back
+    corrections: int  # number of label corrections by people; another ingest does not restore them
     tags: Mapping[str, str]
 
 
@@ -41,7 +41,7 @@ class Removed:
     """Recordings that were removed from a store, or would be."""
 
     recordings: list[RemovedRecording] = field(default_factory=list)
-    left: int = 0  # recordings that stay
+    left: int = 0  # number of recordings that stay in the store
     version_before: int | None = None  # last version of the store with these recordings
     version: int | None = None  # version of the store without them; None if nothing was written
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # slow to import, and not needed if all recordings are in the
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 # Rows of whole episodes that are queried together: bounds memory. Each part costs 40 ms to plan.
 STRETCH_ROWS = 8192
-# Table computed one episode at a time, by the .sql file of its name -> its order.
+# Table whose rows each depend on one episode (its .sql file has the same name) -> sort order.
 BY_EPISODE = {
     "measured_signals": "episode_id, signal",
     "flawed_rows": "transition_id",
@@ -54,7 +54,7 @@ def _rows_of(**columns: pa.DataType) -> pa.DataType:
 
 
 _TEXT, _TEXTS, _COUNT, _NUMBER = pa.string(), pa.list_(pa.string()), pa.int64(), pa.float64()
-TABLES = {  # column of a manifest that holds a table (of summary.sql or BY_EPISODE) -> its type
+TABLES = {  # column of a manifest that holds a table of its recording -> Arrow type of the column
     "episode_rows": _rows_of(
         episode_id=_TEXT,
         episode_index=pa.int32(),
@@ -196,10 +196,10 @@ def _with_summary(manifest: pa.Table, rows: pa.Table, tables: dict[str, pa.Table
 def _of_episodes(
     connection: duckdb.DuckDBPyConnection, rows: pa.Table, *, custom: bool
 ) -> dict[str, pa.Table]:
-    """Compute the tables BY_EPISODE, some whole episodes at a time.
+    """Compute the tables in BY_EPISODE, some whole episodes at a time.
 
-    Their rows depend only on the steps of one episode, and a window over all steps would need twice
-    their memory.
+    Each row depends only on the steps of one episode, and a window function over all steps would
+    need twice their memory.
     """
     for number, (first, stop) in enumerate(_whole_episodes(rows)):
         connection.register("transitions", _unchunked(rows.slice(first, stop - first)))
@@ -209,7 +209,7 @@ def _of_episodes(
         if custom:
             added = _query("measured_custom_signals")
             connection.execute(f"INSERT INTO measured_signals\n{added}")
-        connection.unregister("transitions")  # frees its copies before the next ones are made
+        connection.unregister("transitions")  # frees its copies before the next part is copied
     return {
         name: connection.sql(f"FROM {name} ORDER BY {order}").to_arrow_table()
         for name, order in BY_EPISODE.items()
@@ -217,7 +217,7 @@ def _of_episodes(
 
 
 def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
-    """Cut the rows into parts of about STRETCH_ROWS; return each as first and one past the last.
+    """Cut rows into parts of about STRETCH_ROWS; return indices of each first and past-last row.
 
     No episode is in two parts. If the rows of an episode are not contiguous, all rows are one part.
     """
@@ -238,7 +238,7 @@ def _unchunked(rows: pa.Table) -> pa.Table:
 
 
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
-    """Return rows with the packed ends of episodes from their manifest in the metadata."""
+    """Put the packed episode ends, which come from the rows' manifest, into the rows' metadata."""
     metadata = {ENDS: packed_ends.encode()} if packed_ends else None
     return rows.replace_schema_metadata(metadata)
 
@@ -281,10 +281,10 @@ def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
 
 
 SKETCH_HASHES = 256
-MIN_HASHES = 3  # that two recordings must share
-LARGELY = 0.5  # share of the smaller recording's rows
+MIN_HASHES = 3  # least number of hashes that two recordings of the same drive share
+LARGELY = 0.5  # least share of the smaller recording's distinctive rows that they share
 NEARLY_ALL = 0.95  # less than 1: near its cut, a part has rows that the whole does not have
-# Another recording was replaced meanwhile, or is damaged: the one being ingested must not fail.
+# Errors if another recording was replaced meanwhile or is damaged: the ingest ignores them.
 UNREADABLE = (OSError, StoreError, pa.ArrowException)
 PART_ROWS = 2048  # rows hashed at a time: bounds memory
 _LARGE = 2e15  # stands for infinity, and limits scaled values
@@ -297,10 +297,10 @@ class RepeatedDrive:
 
     recording_id: str
     source_file: str
-    rows: int  # rows that both have
-    share: float  # these as a share of the new recording's rows
-    share_of_other: float  # as a share of the stored recording's rows
-    held: float  # as a share of the stored recording's distinctive rows
+    rows: int  # number of rows that both have
+    share: float  # `rows` as a share of the new recording's rows
+    share_of_other: float  # `rows` as a share of the stored recording's rows
+    held: float  # `rows` as a share of the stored recording's distinctive rows
 
     @property
     def is_part(self) -> bool:
@@ -323,7 +323,7 @@ class RepeatedDrive:
 
 @dataclass(frozen=True)
 class Sketch:
-    """The smallest row hashes of a stored recording, (k,) ascending, and its ids."""
+    """Ids of a stored recording and its smallest row hashes, (k,) ascending, to find repeats."""
 
     recording_id: str
     ingest_id: str
@@ -373,7 +373,7 @@ def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
     if not len(mine):
         return []
     hashes = np.concatenate([one.hashes for one in sketches] or [mine[:0]])
-    marked = np.zeros(1 << 16, np.bool_)  # most hashes differ in the low bits: a quick lookup
+    marked = np.zeros(1 << 16, np.bool_)  # by low 16 bits: quickly excludes most hashes
     marked[mine.astype(np.uint16)] = True
     at = np.flatnonzero(marked[hashes.astype(np.uint16)])
     at = at[mine[np.minimum(np.searchsorted(mine, hashes[at]), len(mine) - 1)] == hashes[at]]
@@ -386,7 +386,7 @@ def looks_alike(mine: Hashes, other: Sketch) -> bool:
     """Return whether rows with hashes `mine` (N,) may largely repeat another recording."""
     if not len(other.hashes):
         return False
-    # A full sketch has all hashes of its recording up to its own largest one.
+    # A full sketch lacks its recording's larger hashes, so compare up to its largest one only.
     full = len(other.hashes) == SKETCH_HASHES
     compared = mine[mine <= other.hashes[-1]] if full else mine
     both = len(np.intersect1d(compared, other.hashes))
@@ -430,8 +430,8 @@ def find_repeat(
 ) -> RepeatedDrive | None:
     """Return the stored recording that repeats the most of the new rows, or None.
 
-    `mine` are the new rows' `distinctive` hashes. Only if a sketch looks alike, `rows()` is called
-    for the new rows, and `read(recording_id, ingest_id)` for those of the stored recording.
+    `mine` are the new rows' `distinctive` hashes. `rows()` returns the new rows, and
+    `read(recording_id, ingest_id)` those of a stored recording; they are called if a sketch fits.
     """
     found = []
     for one in sharing(mine, list(sketches)):

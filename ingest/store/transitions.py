@@ -42,17 +42,17 @@ GROUP_ROWS = 8192  # steps of whole episodes that are processed together: bounds
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """R steps of consecutive episodes. The last step of each begins no transition: it only ends."""
+    """R steps of consecutive episodes. The last step of an episode begins no transition."""
 
     tick: Ints  # (R,)
     episode: Ints  # (R,) index of the episode
-    step: Ints  # (R,) in its episode, from 0
+    step: Ints  # (R,) index of the step in its episode
     is_end: Bools  # (R,)
-    signals: Signals  # leading axis R, with the route of the row's episode
-    labels: dict[str, Bools]  # condition that these steps can show -> (R,)
+    signals: Signals  # leading axis R; signals of the route are for the route of the row's episode
+    labels: dict[str, Bools]  # name of an evaluated condition -> whether it holds, (R,)
     custom: pa.Table  # (R,) the profile's own signals
     probabilities: dict[str, F32]  # condition with a probability rule -> (R,); NaN: unknown
-    exposures: dict[str, Bools]  # exposure that these steps can show -> (R,)
+    exposures: dict[str, Bools]  # name of an evaluated exposure -> whether it holds, (R,)
 
     @property
     def starts(self) -> Ints:
@@ -115,7 +115,7 @@ def episode_rows(
     is_end = step == np.repeat(lengths, lengths) - 1
     episode = np.repeat(np.arange(group.start, group.stop, dtype=np.int64), lengths)
     signals = {name: column[tick] for name, column in steps.signals.items()}
-    # A tick may end one episode and begin the next: each episode has it with its own route.
+    # A tick may end one episode and begin the next, with a new route. The end keeps the old route.
     old = np.flatnonzero(is_end & np.isin(tick, changed_route(steps)))
     if len(old):
         before, routing = tick[old] - 1, steps.routing
@@ -145,8 +145,8 @@ def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -
 def episode_ends(table: pa.Table) -> pa.Table | None:
     """Return the last steps of a recording's episodes as a `label_table`, or None if missing.
 
-    They begin no transition, but conditions that look ahead need them. They are stored in the
-    metadata of the rows, and so of their Parquet file.
+    These steps begin no transition, but conditions that look ahead need them. They are stored in
+    the metadata of the rows, and so of their Parquet file.
     """
     packed = (table.schema.metadata or {}).get(ENDS)
     if packed is None:
@@ -178,7 +178,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class TransitionValues:
-    """Columns of N transitions that are not signals or labels of their R steps."""
+    """Columns of N transitions, other than the signals and labels of their R steps."""
 
     observation: NDArray[np.float32]  # (R, D) at every step, including the last of each episode
     action: Ints  # (N,)
@@ -190,10 +190,10 @@ class TransitionValues:
     truth: Sequence[str | None]  # (N,) true condition
     policy: Sequence[str]  # (N,)
     policy_version: Sequence[str | None]  # (N,)
-    probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of the action
+    probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of choosing `action`
     perturbation: tuple[pa.Array, pa.Array]  # (N,) names, and (N,) values
     true_exposure: Sequence[str | None] | None = None  # (N,); None: unknown in all rows
-    goal_source: str | None = None  # of all rows; None: there is no goal
+    goal_source: str | None = None  # the same for all rows; None: there is no goal
     logged_ns: Ints | None = None  # (N,); None: stamp_ns plus the manifest's clock_offset_ns
 
 
@@ -207,22 +207,22 @@ def recording_table(
 ) -> Work[tuple[pa.Table, EpisodeRows]]:
     """Return all transitions of a recording, and their steps (without signals).
 
-    They are computed for some whole episodes at a time, so that the signals of only one group are
-    in memory. This changes no value: an episode's rows and labels depend on its own steps alone.
+    Rows are computed for a group of whole episodes at a time, so that only its signals are in
+    memory. This changes no value: an episode's rows and labels depend on its own steps alone.
     `done` is called with the number of ticks that are finished.
 
     Raises:
         RecordingError: as `transitions`.
     """
     tables, ends, parts = [], [], []
-    same: dict[str, pa.ChunkedArray] = {}  # column with one value in all rows -> its longest array
+    same: dict[str, pa.ChunkedArray] = {}  # constant column -> array for the largest group so far
     for group in groups(episodes):
         rows = yield from episode_rows(profile, steps, episodes, group)
         made = transitions(profile, steps, episodes, rows, provenance)
         tables.append(_share_constants(made, same))
         del made
         ends.append(rows.ends_table())
-        # Signals take most of the memory.
+        # Drop the signals, which take most of the memory.
         parts.append(replace(rows, signals={}, custom=rows.custom.select([])))
         done(int(rows.tick.max()) + 1)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
@@ -249,7 +249,7 @@ def _join(tables: list[pa.Table]) -> pa.Table:
 
 
 def _share_constants(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
-    """Let all groups share the memory of columns that have one value in the whole recording."""
+    """Share memory between groups for columns that have one value in the whole recording."""
     for name in _CONSTANT_COLUMNS:
         longest = same.setdefault(name, rows[name])
         if len(longest) < len(rows):

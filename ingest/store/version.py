@@ -28,12 +28,12 @@ from restock.errors import StoreError
 from restock.files import first_line
 
 Version = int | datetime
-# The description of a store's tables. Raise it when columns, their meaning or summaries change.
+# Description in each table's metadata. Raise the number if columns, meanings or summaries change.
 FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
 LOG = "_delta_log"  # folder of a table's log
 _LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
-_SHORT = 1024  # bytes; only smaller commits are checked: cut after commitInfo, one has a third
+_SHORT = 1024  # bytes; only smaller commits are checked: one cut after commitInfo has a third
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
@@ -58,7 +58,7 @@ def parse_version(text: str) -> Version:
 def split_version(place: str) -> tuple[str, Version | None]:
     """Split `store@12` or `store@2026-11-01` into path and version (None if there is no `@`).
 
-    If a path of the whole name exists, it has no version.
+    If `place` is itself an existing path, its `@` does not begin a version.
     """
     match = _AFTER_AT.fullmatch(place)
     if match is None or Path(place).exists():
@@ -102,7 +102,7 @@ def expect_whole(log: Path, version: int, *, where: str) -> None:
                 return
             short = file.stat().st_size < _SHORT
             problem = _problem_of_commit(file) if short else None
-        except FileNotFoundError:  # an older commit that a checkpoint of another kind covers
+        except FileNotFoundError:  # deleted, as a checkpoint of another format has it
             return
         if problem:
             raise _damaged(file, problem, where, newest=version)
@@ -150,7 +150,7 @@ def _problem_of_commit(file: Path) -> str | None:
     info = actions[0].get("commitInfo")
     if len(actions) == 1 and isinstance(info, dict):
         ours = str(info.get("operation_name", "")).startswith("restock")
-        # Others write commits that change nothing.
+        # Other tools may write commits with only this line, which change nothing.
         if ours or info.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
             return "is truncated: it does not list its changes"
     return None
@@ -202,7 +202,7 @@ _BY_WRITER_VERSION = {
     5: ("columnMapping",),
     6: ("identityColumns",),
 }
-_LISTED_READER, _LISTED_WRITER = 3, 7  # the newest versions, and the first that list features
+_LISTED_READER, _LISTED_WRITER = 3, 7  # the newest protocols, and the first with feature lists
 # Feature -> pattern of the property (of the table or a column) without which it has no effect.
 _PROPERTIES = {
     "appendOnly": r"delta\.appendOnly=true",
@@ -246,7 +246,7 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
-    """Check that Restock may commit to a store's table; `removing`: even remove files.
+    """Check that Restock may commit to a store's table and, if `removing`, remove its files.
 
     Raises:
         StoreError: the table uses a feature that Restock cannot write.
@@ -266,9 +266,9 @@ def _features(
     by_version: Mapping[int, tuple[str, ...]],
     key: str,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what a table's protocol requires: the features in use, each with a phrase for errors.
+    """Yield each feature that a table uses, with a phrase that names it in error messages.
 
-    If `version` is above `newest`, the newest one that Restock knows, also yield "" for it.
+    If the protocol's `version` is above `newest`, which Restock knows, yield "" (no feature) first.
     """
     if version > newest:
         yield "", f"version {version} of the protocol ({key})"
@@ -286,7 +286,7 @@ def _name(table: DeltaTable) -> str:
 def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None:
     """Return the error for table `name` if Delta's library does not support one of its features.
 
-    Return None if `error` is another one.
+    Return None for any other `error`.
     """
     named = _UNSUPPORTED.search(str(error))
     if named is None:

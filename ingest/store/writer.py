@@ -70,8 +70,8 @@ class Staged:
 
     recording_id: str
     ingest_id: str
-    manifest: pa.Table  # its row, with its summary
-    rows: AddedFile  # its file in `transitions`
+    manifest: pa.Table  # the row for `recordings`, with its summary
+    rows: AddedFile  # the recording's file in `transitions`
     columns: pa.Schema  # the columns of that file
     contents: Hashes  # hashes of its distinctive rows, (N,) ascending
     instead_of: str | None = None  # the ingest that these rows were made from and replace, if any
@@ -97,7 +97,7 @@ class StoreWriter(TableCommits):
         """Return the stored recording that repeats most of this one's rows, or None.
 
         Rows count as the same if their stamps differ by at most half a control period (`period_s`).
-        Recordings in `ahead`, staged before this one, are compared too. Ingests in `aside` are not.
+        Recordings in `ahead`, staged before this one, are compared too, but no ingests in `aside`.
         """
         others = [one for one in self.shown() if one.ingest_id not in aside]
         sketches = [
@@ -112,10 +112,10 @@ class StoreWriter(TableCommits):
     def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
         """Write a recording's frames to a file of `frames`; return the number of frames.
 
-        If no manifest is committed that names the file, call `discard_frames`.
+        If the manifest that names the file is not committed, call `discard_frames`.
 
         Raises:
-            StoreError: it cannot be written.
+            StoreError: the file cannot be written.
         """
         count = 0
         with (
@@ -141,7 +141,7 @@ class StoreWriter(TableCommits):
         Returns the version of `transitions` that has them.
 
         Raises:
-            StoreError: the path is not a store's, or other writers were faster too many times.
+            StoreError: the path is not a store, or other writers were faster too many times.
         """
         return self.write_all([(manifest, rows)])
 
@@ -154,7 +154,7 @@ class StoreWriter(TableCommits):
         """Write several recordings, as (manifest row, transitions), in one commit.
 
         `instead_of` maps each recording to the ingest that its new rows were made from: if another
-        writer has replaced one since, nothing is written.
+        writer has replaced one of these ingests since, nothing is written.
 
         Raises:
             StoreError: as `write`, or another writer has replaced or removed one of the recordings.
@@ -205,7 +205,7 @@ class StoreWriter(TableCommits):
         return staged
 
     def commit_staged(self, staged: Sequence[Staged]) -> int:
-        """Commit staged recordings, each different, all or none; call `fit` before.
+        """Commit staged recordings, all or none. They must differ, and must have passed `fit`.
 
         Returns the version of `transitions` that has them.
 
@@ -230,8 +230,8 @@ class StoreWriter(TableCommits):
     def _commit_manifests(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> None:
         """Write and commit the manifests that are not in `recordings` yet.
 
-        An earlier attempt that failed may have committed some. From MIN_JOINED on, they become one
-        file, which stays in the table even if some of its recordings cannot be committed.
+        An earlier attempt that failed may have committed some. MIN_JOINED manifests or more become
+        one file, which stays in the table even if some of its recordings cannot be committed.
         """
         held = self._listing(RECORDINGS).paths
         new = [one for one in staged if one.ingest_id not in held]
@@ -253,8 +253,8 @@ class StoreWriter(TableCommits):
         Returns the last version of `transitions` that has them, and the new version without them.
 
         Raises:
-            StoreError: one was ingested again or removed in the meantime, or other writers were
-                faster too many times. The store is unchanged.
+            StoreError: a recording was ingested again or removed in the meantime, or other writers
+                were faster too many times. The store is unchanged.
         """
         versions = self.remove_rows(ingests, operation)
         self.remove(RECORDINGS, {own_path(*ids) for ids in ingests.items()})
@@ -264,7 +264,7 @@ class StoreWriter(TableCommits):
         """Ensure that the tables exist and have the columns of these recordings.
 
         Raises:
-            StoreError: they cannot be written, or have columns of other types under these names.
+            StoreError: a table cannot be written, or has a column of the same name, but other type.
         """
         for one in staged:
             if one.columns not in self._fitting:
@@ -284,7 +284,7 @@ class StoreWriter(TableCommits):
         Recordings whose rows were committed after all are left alone.
 
         On S3 nothing is deleted: a commit without an answer may still appear later. `clean`
-        deletes the files when they are older than its window.
+        deletes the files when they are older than its retention window.
         """
         if self.path.folder is None:
             return
@@ -310,7 +310,7 @@ class StoreWriter(TableCommits):
         for name in (RECORDINGS, TRANSITIONS):
             if not self.path.has_table(name):
                 continue
-            # A stale file may still belong to a version within the window: vacuum excludes those.
+            # An old file may still belong to a version within the window: vacuum leaves such out.
             stale = self._written_before(name, retention_hours)
             if not stale.difference(file.path for file in self.files(name)):
                 continue
@@ -321,9 +321,9 @@ class StoreWriter(TableCommits):
                     enforce_retention_duration=False,
                     full=True,
                 )
-            # Vacuum also names files that were deleted long ago, as long as the log has them.
+            # Vacuum also returns files that were deleted long ago, as long as the log has them.
             deleted += [f"{name}/{file}" for file in sorted(stale.intersection(unneeded))]
-        # Vacuum ran dry and files are deleted here, so that cleaning adds no commit to the table.
+        # Vacuum only listed files; deleting them here avoids its commit to the table.
         self.path.delete(deleted)
         frames = self._unnamed_frames(retention_hours)
         self.path.delete(frames)
@@ -332,14 +332,14 @@ class StoreWriter(TableCommits):
     def _written_before(self, name: str, retention_hours: int) -> set[str]:
         """Return the files in a folder that are older than the window.
 
-        A manifest's file may be younger than its removal in the log: compaction writes it again if
-        a version within the window needs it.
+        This goes by the files' write times, not by Delta's log: compaction may write the file of a
+        manifest again that the log has removed, if a version within the window needs it.
         """
         before_s = time.time() - retention_hours * 3600
         return {path for path, at_s in self.path.times(name).items() if at_s <= before_s}
 
     def _unnamed_frames(self, retention_hours: int) -> list[str]:
-        """Return frame files older than the window that no manifest file names, removed or not."""
+        """Return frame files older than the window that no manifest names, removed or active."""
         found = self._written_before(FRAMES, retention_hours)
         if not found:
             return []
@@ -353,7 +353,7 @@ class StoreWriter(TableCommits):
         return [f"{FRAMES}/{path}" for path in sorted(found)]
 
     def _abandoned(self, retention_hours: int) -> list[str]:
-        """Return manifests without rows, too old for a writer to be about to commit their rows."""
+        """Return manifests without rows that are too old for their writer to be still at work."""
         if not self.path.has_table(RECORDINGS) or not self.path.has_table(TRANSITIONS):
             return []
         manifests = self.files(RECORDINGS)  # read first: rows committed since then are found below
@@ -362,7 +362,7 @@ class StoreWriter(TableCommits):
         return [
             file.path
             for file in manifests
-            # A joined file had recordings with rows: older versions still need it.
+            # Joined files are kept: older versions may need manifests in them.
             if file.own
             and file.added_ms < before_ms
             and not shown & {one.ingest_id for one in file.ingests}
@@ -377,16 +377,16 @@ class StoreWriter(TableCommits):
         options = parquet_options(rows.schema)
         with written_whole(self.path, path):
             size = self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
-        # Encoding took tens of MB, which Arrow would keep, and a commit takes as much again.
+        # Free tens of MB that Arrow keeps after encoding: a commit takes as much again.
         pa.default_memory_pool().release_unused()
         return size
 
 
-FILE_ROWS = 500_000  # most rows of a joined file, which is rewritten to replace one recording
+FILE_ROWS = 500_000  # maximum in a joined file: replacing one recording rewrites the whole file
 MIN_FILES = 2
-FOLD_FILES = 16  # files of few manifests that trigger a fold; each costs 10 ms to open or to join
+FOLD_FILES = 16  # number of small manifest files that triggers a fold; each takes 10 ms to open
 MIN_JOINED = 8  # from this many recordings in a commit, their manifests become one file
-FULL_MANIFESTS = 500  # a file of so many is left alone: joining it again would take a second
+FULL_MANIFESTS = 500  # a file with so many is not joined again, as that would take a second
 OPERATION = "restock store compact"
 
 
@@ -396,12 +396,12 @@ class Compacted:
 
     rows: int = 0  # transitions that were written again
     files_before: int = 0  # files of transitions
-    files_after: int = 0  # without those that other writers added meanwhile
+    files_after: int = 0  # files of transitions, except those that others added meanwhile
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
     summaries: int = 0  # new summaries of recordings whose rows another tool changed
-    changed_meanwhile: int = 0  # files to join, not joined because another writer replaced some
-    version: int | None = None  # of `transitions` after its last commit; None without a commit
+    changed_meanwhile: int = 0  # files left in groups of which another writer has replaced a file
+    version: int | None = None  # version of `transitions` that was committed last; None: no commit
 
 
 def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
@@ -422,9 +422,9 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
         if store.path.has_table(RECORDINGS):
             _Fold.of(store, changed).count(done)
         return done
-    if changed:  # before the rows: summaries of files that Restock wrote are trusted
+    if changed:  # summaries first: joined rows count as Restock's, so theirs will be trusted
         fold(store, done, changed)
-    for group in groups:  # otherwise rows first: if a file is damaged, manifests stay unchanged
+    for group in groups:  # if not `changed`, rows first: a damaged file leaves manifests unchanged
         _merge_rows(store, group, done)
     if not changed:
         fold(store, done)
@@ -438,12 +438,12 @@ def fold(
     *,
     small: bool = False,
 ) -> None:
-    """Join the manifests of all recordings into one file; if `small`, only those in small files.
+    """Join the manifests of all recordings, or only those in `small` files, into one file.
 
-    Ingests whose rows another tool `changed` get new summaries.
+    Ingests in `changed`, whose rows another tool has changed, get new summaries.
 
-    Manifests without rows (not there yet, or replaced) and files with many manifests stay as they
-    are.
+    Manifests whose rows are not yet committed or were replaced keep or get a file of their own.
+    Files with many manifests stay as they are.
     """
     done = done or Compacted()
     made: dict[str, pa.Table] = {}  # ingest -> manifest with its new summary
@@ -476,7 +476,7 @@ def fold(
 
 
 def fold_if_many(store: StoreWriter) -> None:
-    """Fold the manifests if so many small files make every opening slow."""
+    """Fold manifests if they are in FOLD_FILES or more small files, which are slow to open."""
     if not store.path.has_table(TRANSITIONS):
         return
     sizes = [len(file.ingests) for file in store.files(RECORDINGS)]
@@ -489,16 +489,16 @@ def fold_if_many(store: StoreWriter) -> None:
 class _Fold:
     """Plan of a fold: the files that it joins, and the ingests that the new file will have."""
 
-    files: int  # all files of manifests
+    files: int  # number of all files of manifests
     chosen: list[StoredFile]
     live: list[Ingest]
     lacking: list[Ingest]  # the live ingests whose summary does not match their rows
 
     @classmethod
     def of(cls, store: StoreWriter, changed: Collection[str], *, small: bool = False) -> _Fold:
-        """Plan a fold. If `small`, leave joined files with more ingests than all smaller ones have.
+        """Plan a fold. If `small`, leave out joined files that outweigh all smaller files together.
 
-        So each manifest is rewritten only a few times, however many follow.
+        So each manifest is rewritten only a few times, however many manifests follow.
         """
         shown = {one.ingest_id for one in store.shown()}
         files = store.files(RECORDINGS)
@@ -526,7 +526,7 @@ class _Fold:
         return bool(self.lacking) or len(self.chosen) >= MIN_FILES
 
     def count(self, done: Compacted) -> None:
-        """Enter the numbers of files before and after the fold, and of new summaries."""
+        """Set counts in `done`: manifest files before and after the fold, and new summaries."""
         done.manifests_before = done.manifests_after = self.files
         if self.worth_it:
             done.manifests_after -= len(self.chosen) - 1
@@ -549,9 +549,9 @@ def _manifest_of(manifests: pa.Table, one: Ingest) -> pa.Table:
 
 
 def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
-    """Write each manifest of replaced rows in the chosen files as a file of its own.
+    """Write each manifest in the chosen files whose rows were replaced to a file of its own.
 
-    Older versions need them, and find them by file name until cleaning deletes them.
+    Older versions of the store find these files by name, until `clean` deletes them.
     """
     live = {one.ingest_id for one in plan.live}
     held = [one for file in plan.chosen for one in file.ingests]
@@ -605,8 +605,8 @@ def _worth_it(group: Sequence[StoredFile]) -> bool:
 
 
 def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted) -> None:
-    """Join these files in their own commit; do nothing if one is gone by then."""
-    held: dict[str, Ingest] = {}  # another tool may have split an ingest's rows over several files
+    """Join a group of files in one commit; if one is gone by then, leave all as they are."""
+    held: dict[str, Ingest] = {}  # sums the rows of ingests that another tool split over files
     for one in (one for file in group for one in file.ingests):
         before = held.get(one.ingest_id)
         held[one.ingest_id] = one._replace(rows=one.rows + (before.rows if before else 0))
