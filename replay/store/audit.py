@@ -52,12 +52,12 @@ class Audit:
     severity: Severity
     advice: str
     doc: str
-    needs: str | None  # "run", "panel" or a table of one: "run.sampled_episodes"
+    needs: str | None  # "run", "panel", or one of their tables, as in "run.sampled_episodes"
     sql: str
 
     @property
     def place(self) -> str | None:
-        """Return what it reads besides the store: "run", "panel" or None."""
+        """Return what the audit reads besides the store: "run", "panel" or None."""
         return self.needs.split(".")[0] if self.needs else None
 
     @property
@@ -251,7 +251,7 @@ def check_thresholds(
 ) -> None:
     """Refuse thresholds that no audit uses.
 
-    If there are `others` besides `audits`, unknown names are refused only if they look misspelt.
+    If `others` may exist besides `audits`, unknown names are refused only if they look misspelt.
 
     Raises:
         ConfigError: an unknown name of an audit or threshold, or a value of another type than the
@@ -320,15 +320,15 @@ EFFECTIVE_EPISODES = 50.0
 class Capacity:
     """How coverage grows with a buffer's capacity, and the smallest capacity that is enough."""
 
-    rows: int  # of the store
-    cells: int  # condition x zone x action cells that the store's rows are in
+    rows: int  # number of rows in the store
+    cells: int  # number of condition x zone x action cells that have rows in the store
     recommended: int  # smallest number of newest rows that meets both requirements
     cells_share: float  # required share of the cells
     effective_episodes: float  # required number of effective episodes
     rows_for_cells: int  # smallest number of newest rows that keeps `cells_share`
-    rows_for_episodes: int | None  # the same for `effective_episodes`; None: all rows have fewer
+    rows_for_episodes: int | None  # like it, for `effective_episodes`; None: too few in all rows
     half_share: float  # share of the cells that the newest half of the rows keeps
-    curve: list[dict[str, Any]]  # capacity, cells, cells_share, conditions, episodes, …
+    curve: list[dict[str, Any]]  # a row per capacity: cells, cells_share, conditions, episodes, …
 
     @property
     def saturated(self) -> bool:

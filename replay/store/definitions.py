@@ -24,7 +24,7 @@ from restock.ingest.task.schema import COLUMNS, FRAME_COLUMNS, RECORDING_COLUMNS
 from restock.process import was_interrupted
 from restock.replay.store.same_drives import install_same_drives
 
-HELD_CONDITIONS = "held_conditions"  # has every column of `transitions`, and `condition`
+HELD_CONDITIONS = "held_conditions"  # view with the columns of `transitions`, and `condition`
 
 # Ending of a column's name -> unit. Longer endings first.
 UNITS = (
@@ -48,7 +48,7 @@ def view_docs() -> dict[str, str]:
 
 
 def column_docs() -> dict[tuple[str, str], str]:
-    """Return (view, column) -> meaning; ("shared", column) is for views that do not define it."""
+    """Return (view, column) -> meaning; for (view, column) without one, see ("shared", column)."""
     meanings = {
         (view, column): text
         for view, table in _read_docs().items()
@@ -58,7 +58,7 @@ def column_docs() -> dict[tuple[str, str], str]:
     meanings |= {
         ("transitions", column.name): column.meaning
         for column in COLUMNS
-        if column.name != "condition"  # rows.sql has another name for it
+        if column.name != "condition"  # rows.sql renames this column
     }
     meanings |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
     meanings |= {
@@ -126,7 +126,7 @@ def _read_docs() -> dict[str, dict[str, str]]:
 
 # In this order: a view may use earlier ones.
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
-FRAMES_SQL = "frames.sql"  # over stored_frames, which exists only on a store's own connection
+FRAMES_SQL = "frames.sql"  # reads stored_frames, which exists only on a store's own connection
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
@@ -141,13 +141,13 @@ MACROS = (
     "return_order.sql",
     "returns.sql",
 )
-SUMMARIES = "summaries.sql"  # replaces others of the same name if all manifests have summaries
-# What `Store.connection` has from the start, for callers that do not use `install_named`.
+SUMMARIES = "summaries.sql"  # replaces views of the same names if all manifests have summaries
+# Files whose views `Store.connection` always has, for callers that do not use `install_named`.
 COMMON = ("rows.sql", "views.sql", "labels.sql", "corrections.sql")
-# Views to copy into memory before many queries. HELD_OF_MANY: few rows from a scan of many, copied
-# in any store if several queries use them. HELD: views that others are made of, copied in stores of
-# few rows, as a table binds in a tenth of the time and its columns are read once. HELD_SUMMARIES:
-# until manifests are joined, each recording's summary is a file of 166 columns.
+# Views that `rows_held` copies into memory. HELD_OF_MANY: few rows from a scan of many, copied in
+# any store if several queries use them. HELD: views that others read, copied in stores of few rows,
+# as DuckDB binds tables ten times faster and reads their columns once. HELD_SUMMARIES: copied
+# because each recording's summary is a file of 166 columns until manifests are joined.
 HELD_OF_MANY = ("driven_episodes",)
 HELD_SUMMARIES = ("stored_summaries",)
 HELD = (
@@ -158,9 +158,9 @@ HELD = (
     "actions",
     "untold_conditions",
 )
-FEW_ROWS = 100_000  # of about 1 kB
-FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes
-# Text of rows.sql; a store's own views use stored_ingests instead, without a scan of rows.
+FEW_ROWS = 100_000  # most rows of a store for HELD: about 1 kB per row
+FEW_SUMMARISED_ROWS = 2_000_000  # most rows of a store for HELD_SUMMARIES: about 50 bytes per row
+# Text in rows.sql. `_read_store_sql` makes it read stored_ingests, which saves a scan of rows.
 _INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"
 # A query with one of these words lists views, so that all of them must exist.
 LISTS = {
@@ -191,11 +191,11 @@ class Definitions:
         observation_type: DuckDB type that observations are cast to.
         summaries: whether the common views read `stored_summaries` instead of rows.
         tables: name of a `stored_…` table -> function that creates it when a query needs it.
-        replaced: names of tables -> function that creates them in place of views of these names
-            when a query names one; they take too long to create for a mere list of views.
+        replaced: names of views -> function that replaces them by tables when a query names one;
+            this takes too long to do when a query only lists views.
 
-    `computed` are tables and macros that Python computes, in the form of `replaced`. `made` are the
-    names of the views and macros created so far.
+    `computed` maps names of tables and macros to a function that creates them, for those computed
+    in Python. `made` has the names of the views and macros created so far.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Replace these views by tables of their rows; meanwhile the views have other names."""
+        """Replace these views by tables of their rows; `release` restores the views."""
         self._make(views)
         for view in views:
             self._connection.execute(
@@ -299,7 +299,7 @@ class Maker(Protocol):
         """Create all tables and views."""
 
 
-# Values are weak too: a Definitions refers to its store, and with it to the connection.
+# Values are weak, too: a Definitions refers to its connection, and would keep the key alive.
 _DEFINITIONS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
 _MAKERS: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Maker]] = WeakKeyDictionary()
 
@@ -327,7 +327,7 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Keep views that many of these queries use in memory while the block runs them."""
+    """Replace views that many of these queries use by tables in memory, until the block ends."""
     owner = _definitions_of(connection)
     if owner is None:
         yield
@@ -396,7 +396,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
 
 
 def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the macro `repeated_rows` over any `transitions`; a store's needs no scan of rows."""
+    """Create the macro `repeated_rows` over any `transitions`; a store's macro scans no rows."""
     if connection in _DEFINITIONS:
         install_named(connection, "repeated_rows")
     else:
@@ -404,7 +404,7 @@ def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the table `novelty` over any `transitions`; a store may have it saved already."""
+    """Create the table `novelty` for any `transitions`; a store may have a saved copy of it."""
     if connection in _DEFINITIONS:
         install_named(connection, "novelty")
     else:

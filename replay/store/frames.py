@@ -18,7 +18,7 @@ from restock.ingest.steps.cameras import ImageLayout, ImageProblem, pixels
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
-BATCH_BYTES = 32 << 20  # of frames that are in memory together
+BATCH_BYTES = 32 << 20  # bytes of frames that are in memory at a time
 _LAYOUT = ("encoding", "width", "height", "channels", "bits", "row_bytes", "big_endian")
 _OWN = ("topic", "log_time_ns", "stamp_ns", "size_bytes", "sha256", "data")
 
@@ -30,13 +30,13 @@ class CameraFrame:
     transition_id: int
     recording_id: str
     camera: str
-    frame_index: int  # of the message in its topic, by log time
+    frame_index: int  # index of the frame's message in its topic, by log time
     topic: str
     log_time_ns: int
-    stamp_ns: int  # when it was taken, on the recording's alignment clock
-    age_s: float  # at the step
+    stamp_ns: int  # time of the frame on the recording's alignment clock
+    age_s: float  # age of the frame at the step
     size_bytes: int
-    sha256: str  # of the bytes as recorded
+    sha256: str  # hash of the frame's bytes when they were recorded
     source_file: str
     data: bytes
     layout: ImageLayout
@@ -73,8 +73,8 @@ def camera_frames(
 
     Args:
         store: an open store.
-        rows: SQL over its views with a column `transition_id`, or such ids.
-        camera: its name in the profile; None: every camera.
+        rows: transition ids, or SQL over the store's views that gives a column `transition_id`.
+        camera: the camera's name in the profile; None: every camera.
 
     Raises:
         StoreError: the store has no such camera.

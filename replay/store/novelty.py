@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from restock.replay.store.store import Store
 
 REFERENCE = 2_000  # reference rows per task
-NEAREST = 10  # nearest reference rows, whose mean distance is the novelty
+NEAREST = 10  # number of nearest reference rows; the mean distance to them is the novelty
 NOVEL_SHARE = 0.01  # share of a task's rows that are `novel`: those with the largest novelty
 QUICK_ROWS = 100_000  # up to so many rows, measuring takes seconds
-KEPT = "novelty.parquet"  # in a store: the table `novelty`; its metadata has a hash of the files
+KEPT = "novelty.parquet"  # in a store: table `novelty`, and a hash of the measured files' paths
 T = TypeVar("T", pa.Table, pa.RecordBatch)
 _BATCH_ROWS = 65_536
 _AT_A_TIME = 512  # rows compared at a time
@@ -110,7 +110,7 @@ class Reference:
         square = np.square(self.observation).sum(axis=1)
         for begin in range(0, len(observation), _AT_A_TIME):
             part = slice(begin, begin + _AT_A_TIME)
-            # Squared distances, less the observation's own square, which orders them alike: (n, R).
+            # (n, R) squared distances, less a constant per observation: their order is the same.
             distance = square - 2 * (observation[part] @ self.observation.T)
             distance[own[part, None] == self.episode] = np.inf
             found = np.argpartition(distance, NEAREST - 1, axis=1)[:, :NEAREST]
@@ -155,7 +155,7 @@ def kept_novelty(store: Store) -> pa.Table:
 
 
 def is_quick(store: Store) -> bool:
-    """Return whether the novelty of a store's rows was measured, or can be within seconds."""
+    """Return whether the novelty of a store's rows is saved, or can be measured within seconds."""
     return stored_rows(store.bare) <= QUICK_ROWS or _is_kept(store)
 
 
@@ -201,7 +201,7 @@ def strangest(store: Store, limit: int = 20) -> list[dict[str, Any]]:
 
 
 def novel_rows(store: Store) -> dict[str, Any]:
-    """Return a row for the novel rows, like those of `coverage_by_condition` for each condition.
+    """Summarise the novel rows in one row, like a condition's row in `coverage_by_condition`.
 
     `nominal_rows` counts the novel rows in which no condition holds.
     """

@@ -97,7 +97,7 @@ def parquet_view(
     *,
     schema: str | None = None,
 ) -> str:
-    """Return the statement that creates a view over Parquet files, of unknown columns.
+    """Return the statement that creates a view over Parquet files with unknown columns.
 
     Each query that names the view opens every file to find its columns.
     """
@@ -116,8 +116,8 @@ def _view_of_known(
 ) -> None:
     """Create a view over Parquet files with the column types `kinds`.
 
-    Files and types become variables of the connection. As part of the view, they would be parsed
-    again by each query that names it.
+    Files and types become variables of the connection. If the view's text had them, each query that
+    names the view would parse them again.
     """
     fields = ", ".join(
         f"{literal(column)}: {{name: {literal(column)}, type: {literal(kind)},"
@@ -174,7 +174,7 @@ def literal(value: object) -> str:
 
 
 _TEXT = pa.dictionary(pa.int32(), pa.string())
-FEW_FILES = 64  # up to so many, reading one by one is faster than importing Arrow's data sets
+FEW_FILES = 64  # to read so many files one by one is faster than to import Arrow's data sets
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class StoredTable:
             ) from error
 
     def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Yield the rows of each row group, with columns as for `Location.row_groups`.
+        """Yield the rows of each row group; `columns` are as for `Location.row_groups`.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -252,7 +252,7 @@ class StoredTable:
         return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
 
     def _read_each(self) -> pa.Table:
-        """Read the manifests file by file, with texts that many recordings share stored once."""
+        """Read the manifests file by file; keep texts that recordings share in memory only once."""
         schema = pa.schema(
             [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
         )
@@ -271,9 +271,9 @@ class StoredTable:
 def manifest_tables(
     place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
 ) -> tuple[StoredTable, StoredTable]:
-    """Return the manifests of these transition files as two tables with different columns.
+    """Return two tables of the manifests of these transition files, each with some columns.
 
-    These are `stored_recordings`, without the summaries, and `stored_summaries`.
+    `stored_summaries` has ingest ids and summaries, and `stored_recordings` all other columns.
     """
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())

@@ -20,7 +20,7 @@ from restock.replay.store.parquet_views import damage
 
 T = TypeVar("T")
 
-# DuckDB suggests its internal tables for a misspelt name; they are never what was meant.
+# DuckDB's suggestion of an internal table for a misspelt name, which is never what was meant.
 _OWN_TABLE = re.compile(
     r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information|stored_\d+)_[^"]*"\?'
 )
@@ -28,7 +28,7 @@ ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that change no files; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
 _WITHOUT_ROWS = {"CREATE", "SET", "VARIABLE_SET"}
-# The beginning of an EXPLAIN. EXPLAIN ANALYZE also runs the statement.
+# The beginning of an EXPLAIN, cut off to check the rest, as EXPLAIN ANALYZE also runs the rest.
 _GAP = r"(?:\s|--[^\n]*\n|/\*.*?\*/)*"
 _EXPLAIN = re.compile(
     rf"{_GAP}EXPLAIN\b{_GAP}(?:ANALYZE\b)?{_GAP}(?:\([^()]*\))?", re.IGNORECASE | re.DOTALL
@@ -52,7 +52,7 @@ def query(
 
     Raises:
         StoreError: a file of the store is damaged or missing.
-        QueryError: DuckDB refused a statement, there is none, or one would write.
+        QueryError: DuckDB refused a statement, a statement would write, or the text has none.
     """
     if _COUNT.fullmatch(text) and is_own(connection, "transitions"):
         text = _COUNTED
@@ -214,9 +214,9 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def found(
     connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
 ) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Return column names and rows of a query with `$name` parameters; times as in `values`.
+    """Return column names and rows of a query with `$name` parameters, with times as by `values`.
 
-    The query is bound only once: with many views, binding takes longer than running it.
+    Without such times, the query is bound only once: with many views, binding takes longest.
     """
     connection.execute(text, given)
     columns = connection.description or []
@@ -228,7 +228,7 @@ def found(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
 ) -> list[dict[str, Any]]:
-    """Return the rows of a query as dictionaries, like `found` otherwise."""
+    """Return the rows of a query as `found` does, but as dictionaries by column name."""
     columns, rows = found(connection, text, given)
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
@@ -264,7 +264,7 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
         except KeyboardInterrupt:
             given_up = True
             connection.interrupt()
-            with begins:  # wait until the connection is free, even if the thread was just starting
+            with begins:  # wait for the job to stop; if it did not begin, `given_up` prevents it
                 raise
 
 

@@ -32,8 +32,8 @@ def install_shared_rows(
 ) -> None:
     """Replace the connection's view `shared_rows` by a table computed from manifests.
 
-    `manifests(columns)` reads columns of all manifests, and is called twice. `recordings` maps each
-    ingest whose rows count to its recording; `rows` is the number of their rows.
+    `manifests(columns)` reads columns of all manifests, and is called twice. `recordings` maps
+    ingests to recordings; all other ingests are ignored. `rows` is the number of their rows.
     """
     repeats = RepeatFilter(rows)
     for _, _, rows_of in _distinctive_rows(manifests(("ingest_id", CONTENT)), recordings):
@@ -53,7 +53,7 @@ def install_shared_rows(
     kept = occurs_again(found["content"])
     ids_of_rows = _take_names(names, found.pop("recording")[kept])
     shared = {"recording_id": ids_of_rows} | {name: values[kept] for name, values in found.items()}
-    # A DuckDB table, so that joins know that it is the small side.
+    # Copy to a DuckDB table, so that DuckDB knows that it is the small side of joins.
     connection.register("found_shared_rows", pa.table(shared))
     connection.execute(
         "CREATE TABLE stored_shared_rows AS FROM found_shared_rows;"
@@ -73,8 +73,8 @@ class RepeatFilter:
     def __init__(self, count: int) -> None:
         bits = min(max(int(4 * count).bit_length(), _MIN_BITS), _MAX_BITS)
         self._shift = np.uint64(64 - bits)
-        self._marks = np.zeros(1 << bits, np.uint8)  # per place, bit 0: seen, bit 1: seen again
-        self._last = np.zeros(MARKED << 4, np.int32)  # low bits of a place -> last index there
+        self._marks = np.zeros(1 << bits, np.uint8)  # per hash value: bit 0 seen, bit 1 seen again
+        self._last = np.zeros(MARKED << 4, np.int32)  # low bits of a hash value -> its last index
 
     def add(self, values: NDArray[np.integer]) -> None:
         """Mark these 64-bit numbers, (n,)."""
@@ -83,7 +83,7 @@ class RepeatFilter:
             number = np.arange(len(part), dtype=np.int32)
             low = place & (len(self._last) - 1)
             self._last[low] = number
-            # If two numbers of a part share a place, at least one of them is not the last there.
+            # Of two numbers in a part with the same hash value, at most one is the last in `_last`.
             again = self._marks[place].astype(np.bool_) | (self._last[low] != number)
             self._marks[place] |= 1
             self._marks[place[again]] = 3
@@ -141,9 +141,9 @@ def _split(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
 
 N = TypeVar("N", bound=np.generic)
 MIN_ROWS = 2
-MIN_SHARE = 0.1  # share of the smaller recording's distinctive rows that both must have
-WITHIN_NS = 100_000_000  # largest distance from a pair's shift
-FEW = 5  # up to so many recordings with one content, all their pairs are compared
+MIN_SHARE = 0.1  # least share of the smaller recording's distinctive rows that both have
+WITHIN_NS = 100_000_000  # most that the time shift of a match deviates from the pair's median
+FEW = 5  # if at most so many recordings share a content, all their pairs are compared
 _BATCH_ROWS = 100_000
 _NAMED = "SELECT DISTINCT recording_id, hash(recording_id) FROM transitions"
 _MOVING = """
@@ -177,19 +177,19 @@ def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def same_drives(rows: MovingRows) -> pa.Table:
-    """Find pairs of recordings that share MIN_ROWS distinctive rows, and MIN_SHARE of them.
+    """Find pairs of recordings that share MIN_ROWS distinctive rows, and a share of MIN_SHARE.
 
-    Columns: `recording_id`, `same_as` (the id that sorts later), `rows` that match within WITHIN_NS
-    of the shift, their `share` of the smaller one's distinctive rows, and `later_s`, the shift. If
-    a content is in more than FEW recordings, only pairs with the first are compared, as the number
-    of all pairs grows with the square.
+    Columns: `recording_id`; `same_as`, the id that sorts later; `later_s`, the median time from a
+    row to the same row of `same_as`; `rows`, the number whose time is within WITHIN_NS of it; and
+    `share`, `rows` as a share of the smaller recording's distinctive rows. If a content is in more
+    than FEW recordings, only pairs with the first are compared: all pairs would be too many.
     """
     recording, content, stamp, distinctive = _distinctive(rows)
     first, second = (np.concatenate(parts) for parts in zip(*_pairs(content), strict=True))
     count = max(len(rows.names), 1)
     pair = recording[first].astype(np.int64) * count + recording[second]
     later = stamp[second] - stamp[first]
-    # Many pairs share a few rows by chance: drop them before sorting.
+    # Many pairs share a few rows by chance: drop these pairs before sorting.
     keys, each = np.unique(pair, return_counts=True)
     least = np.maximum(MIN_SHARE * _smaller(keys, count, distinctive), MIN_ROWS)
     kept = np.isin(pair, keys[each >= least])

@@ -67,7 +67,7 @@ AS_WRITTEN = "join_order,build_side_probe_side"
 _UNLIMITED_OR_ZERO = re.compile(r"\s*(?:-|none\b|null\b|[0.]+\s*[a-z%])", re.IGNORECASE)
 MEMORY_LIMIT = "RESTOCK_MEMORY_LIMIT"  # environment variable
 _MEMORY_REMEDY = f'write it like "4GB" or "512MB" ({MEMORY_LIMIT})'
-MAX_CLOSES = 500  # tries, .01 s apart
+MAX_CLOSES = 500  # attempts to close a connection, 0.01 s apart
 T = TypeVar("T")
 
 
@@ -117,7 +117,7 @@ class Store:
         recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
-        self._query_lock = threading.RLock()  # held during the several calls of a query
+        self._query_lock = threading.RLock()  # held over all DuckDB calls of one query
         self.bare = duckdb.connect(
             config={
                 "temp_directory": self._spill.name,
@@ -375,7 +375,7 @@ class Store:
     def _count_changed(self, held: Sequence[StoredFile]) -> list[str]:
         """Return the ingests whose rows other tools may have changed since ingest.
 
-        Also update the number of transitions in their manifests to the rows that the files have.
+        In memory, also set `transitions` of their manifests to the number of rows in the files.
         """
         ids, place = self._manifests["ingest_id"], self._manifests.column_names.index("transitions")
         written = dict(zip(ids.to_pylist(), self._manifests[place].to_pylist(), strict=True))
@@ -432,7 +432,7 @@ class Store:
         return [f"{table.table}/{path}" for table in tables for path in table.paths]
 
     def _frames(self) -> StoredTable:
-        """Return the table of the camera frames that the manifests of its rows name."""
+        """Return the table of camera frames: the files that manifests of the open version name."""
         files = frame_files(self._manifests)
         if files:
             import pyarrow.compute as pc  # slow to import
@@ -518,7 +518,7 @@ def init_script(store: Store) -> str:
 
     It names the files of the open version by absolute paths: write it again after an ingest.
     """
-    beside = set(names_created_in(FRAMES_SQL))  # left out: their files belong to no Delta table
+    beside = set(names_created_in(FRAMES_SQL))  # views left out: their files are in no Delta table
     columns = ", ".join(
         "(" + ", ".join(literal(value) for value in row) + ")"
         for row in store.sql("FROM columns").fetchall()
