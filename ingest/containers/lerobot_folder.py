@@ -44,7 +44,7 @@ from restock.ingest.containers.storage import (
 from restock.ingest.decoding.columns import Channel, MessageBatch
 
 VERSION = "v3.0"
-GAP_S = 10  # pause put between episodes: longer than a profile allows within one
+GAP_S = 10  # seconds between episodes: beyond the usual `max_gap_s` of a profile, which splits them
 MAX_S, MAX_WIDTH = 1e6, 4096  # largest timestamp in seconds; most numbers in a feature
 ROWS, IMAGES = 65_536, 256  # frames read at a time, without and with images
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
