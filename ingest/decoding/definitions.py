@@ -70,7 +70,7 @@ def types_in(content: bytes, name: str, form: str) -> Typesdict:
             if form == "ros2idl":
                 types.update(_idl_types(lines))
                 continue
-            own = f"{part.rpartition('/')[0]}/Header"  # rosbags would take std_msgs/Header
+            own = f"{part.rpartition('/')[0]}/Header"  # ROS 1 and rosbags take std_msgs/Header
             if form == "ros2msg" and own in parts.keys() - {part}:
                 lines = own.join(_HEADER.split(lines))
             types.update(get_types_from_msg(lines, part))
