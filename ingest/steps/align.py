@@ -44,20 +44,20 @@ if TYPE_CHECKING:
     from restock.ingest.profile.tables import Clock
 
 NS = 1_000_000_000
-AHEAD_NS = 50_000_000  # a transform stamped further ahead is timed by its reception
+AHEAD_NS = 50_000_000  # a transform stamped later than its reception by more is timed by it
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # time of a simulation
 BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
-TOLERANCE_S = 0.1  # half a control period
+TOLERANCE_S = 0.1  # default tolerance of times: half a control period of .2 s
 IMPOSSIBLE_S = 0.25  # stamps this long after the reception come from another clock
-OFTEN = 20  # topics with so many messages have some before and after a clock was set
+OFTEN = 20  # fewest messages of a topic that must show when the recorder's clock was set back
 LATENCY_S = 1.0  # largest latency of a topic that is stamped by the recorder's clock
-MAX_TICKS = 20_000_000  # per segment at a fixed rate: 46 days at 5 Hz, too many for the memory
+MAX_TICKS = 20_000_000  # limit per segment at a fixed rate (46 days at 5 Hz), to protect the memory
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # rows of a topic's columns; a slice takes no memory
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Messages of one topic on the alignment clock, in its order."""
+    """Messages of one topic, sorted by their time on the alignment clock."""
 
     stamp_ns: Ints  # (N,) ascending
     row: NDArray[np.intp]  # (N,) rows of the topic's columns
@@ -80,7 +80,7 @@ class LatestMessages:
     """The latest message of a topic at each of T ticks."""
 
     row: NDArray[np.intp]  # (T,) row of the topic's columns; 0 if there is no message yet
-    age_ns: Ints  # (T,)
+    age_ns: Ints  # (T,) time from the message to the tick; 0 if there is no message yet
     known: NDArray[np.bool_]  # (T,) whether there is a message
     fresh: NDArray[np.bool_]  # (T,) whether there is one that is not older than the maximum age
 
@@ -104,15 +104,15 @@ class ClockReport:
     """Findings about the clocks of a recording, stored with its counts."""
 
     alignment: str
-    offset_ns: int = 0  # of the first segment
+    offset_ns: int = 0  # log time minus stamp in the first segment
     spread_ns: int = 0  # 1st to 99th percentile of the errors of the offset, or of the map
     pace: float | None = None  # seconds of robot time per second of log time; None: no drift
     mapped_by: str | None = None  # topic that the map is fitted to; None: constant offset
-    jumps: int = 0  # of the alignment clock, including `set_back`
+    jumps: int = 0  # how often the alignment clock jumps, including `set_back`
     off_clock: dict[str, int] = field(default_factory=dict)  # topic -> messages left out
-    restamped: dict[str, int] = field(default_factory=dict)  # topic -> latched, put at log time
+    restamped: dict[str, int] = field(default_factory=dict)  # topic -> messages put at log time
     set_back: int = 0  # how often the recorder's clock was set back
-    by_reception: dict[str, int] = field(default_factory=dict)  # topic -> how far ahead it is, ns
+    by_reception: dict[str, int] = field(default_factory=dict)  # topic -> ns its stamps are ahead
 
 
 def align(
@@ -166,8 +166,8 @@ def align(
 def _split_laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
     """Split each topic's messages at the points where the recorder's clock was set back.
 
-    At such a point, log time goes back on every frequent topic by about the same time, to before
-    messages that were recorded already. Returns one empty part if the clock was never set back.
+    At such a point, the log times of all frequent topics go back by about as much, and so repeat
+    times of earlier messages. Returns `[{}]` if the clock was never set back.
     """
     laps = {name: one.laps() for name, one in topics.items() if len(one) >= OFTEN}
     if not laps or len(set(laps.values())) > 1 or not max(laps.values()):
@@ -213,7 +213,7 @@ def _align(
         topics = {name: columns for name, columns in topics.items() if name != CLOCK_TOPIC}
     else:
         simulated = None
-    every = np.arange(max(map(len, topics.values()), default=0))  # shared by all topics
+    every = np.arange(max(map(len, topics.values()), default=0))  # shared row numbers
     if clock.alignment == "log_time":
         samples = {name: _sort(c.log_time_ns, every[: len(c)]) for name, c in topics.items()}
         return [ClockSegment(samples, ClockMap.constant(0))]
@@ -246,7 +246,7 @@ def _align(
 
 
 def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
-    """Return whether the stamps of the stamped topic with most messages drift from log time."""
+    """Return whether stamps drift from log time, by the stamped topic with the most messages."""
     stamped = stamped_topics(topics, frozenset())
     reference = max(stamped.values(), key=len, default=None)
     if reference is None:
@@ -286,13 +286,13 @@ def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
 def delay_ns(columns: TopicColumns, rows: Rows = slice(None)) -> Ints:
     """Return (log time - header stamp) of messages of a stamped topic, (N,).
 
-    Not kept, as the delays of all topics would take half as much memory as all their times.
+    Delays are computed where needed: to keep them would take half the memory of all times.
     """
     return columns.log_time_ns[rows] - np.asarray(columns.fields[STAMP], np.int64)[rows]
 
 
 def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[Ints, int]:
-    """Return a segment's ticks (T,) of the control clock, and the number of commands without one.
+    """Return a segment's control ticks (T,), and the number of commands that have no tick.
 
     `steps = "command"`: one tick per command, except commands closer than 3/4 of the period to the
     last tick. `steps = "rate"`: one tick per period, from the first command to `end_ns`.
@@ -386,7 +386,7 @@ class _Drifts:
             for name in stamped.keys() - {reference}:
                 if len(delay := delay_ns(stamped[name], inside[name])):
                     medians.append(median(delay))
-            # Latency only adds to the clocks' offset, so the topic with the least delay is best.
+            # A delay is the clocks' offset plus latency, so the least delay is nearest the offset.
             offset = min(each for each in medians if abs(each - middle) <= jump_ns)
             return ClockMap.constant(offset), middle
         source, knots = reference, (log, delay)
@@ -411,7 +411,7 @@ class _Drifts:
                 f" the {self.tolerance_ns / NS:g} s of half a control period",
                 remedy=BY_LOG_TIME,
             )
-        ahead = []  # of the map, per topic; the topic with the least delay is best
+        ahead = []  # how far each topic's stamps are ahead of the map; most with least latency
         for name, columns in stamped.items():
             log = columns.log_time_ns[inside[name]]
             if len(log):
@@ -431,7 +431,7 @@ class _Drifts:
         inside: Mapping[str, Rows],
         clock_map: ClockMap,
     ) -> None:
-        """Add commands whose stamps are off this segment's clock to `report.by_reception`."""
+        """Add to `report.by_reception` the commands that are stamped by another clock."""
         for name in commands & topics.keys():
             if name in self.report.by_reception or STAMP not in topics[name].fields:
                 continue
@@ -464,7 +464,7 @@ def _segment(
             continue
         stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
         if name in transforms:
-            received = clock_map.stamped(log_time)  # on the alignment clock
+            received = clock_map.stamped(log_time)  # reception, on the alignment clock
             stamp = np.where(stamp - received > AHEAD_NS, received, stamp)
         away = log_time - middle if clock_map.is_constant else clock_map.stamped(log_time)
         away -= stamp

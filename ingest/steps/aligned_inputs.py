@@ -37,10 +37,10 @@ from restock.ingest.steps.cameras import CameraFrames, usable_frames
 from restock.ingest.steps.frames import Edges, Placement, PoseSeries, Tree, poses_along
 from restock.ingest.steps.input_columns import InputColumns
 
-# A change of the behaviour policy is published at the tick from which it applies, and may arrive a
-# moment later. This lead is only for provenance, never for what the robot knew.
+# Messages about the driver or the simulator may arrive a moment after the tick from which they
+# apply: a tick uses them if they are at most this late. They are never what the robot knew.
 PROVENANCE_LEAD_S = 0.1
-SAME_COMMAND = 1e-6  # m/s or rad/s; commands that differ by less are the same one, passed on
+SAME_COMMAND = 1e-6  # m/s or rad/s; if commands of two topics differ by less, one repeats the other
 SIDEWAYS_MPS = 1e-3  # slower sideways speeds count as 0
 T = TypeVar("T")
 
@@ -52,7 +52,7 @@ class AlignedInputs:
     profile: Profile
     inputs: InputColumns
     segments: Sequence[ClockSegment]
-    ticks: Sequence[Ints]  # of each segment; T in total
+    ticks: Sequence[Ints]  # times of the ticks of each segment; T ticks in total
     tree: Tree | None = None  # None: the profile has no [frames]
     clock: ClockReport = field(default_factory=lambda: ClockReport(""))
     commands_between: int = 0  # commands without a tick of their own
@@ -69,10 +69,10 @@ class AlignedInputs:
         return replace(self, ticks=ticks)
 
     def latest(self, name: str) -> LatestMessages:
-        """Return an input's latest message at each tick; its age is negative if it comes later.
+        """Return an input's latest message at each tick; one after the tick has a negative age.
 
-        What the robot knew is at or before the tick. The command at a fixed rate, and inputs that
-        are only provenance or truth, may come a moment later (`_lead_s`).
+        Messages of what the robot knew are never after the tick. Those of the command at a fixed
+        rate, of provenance and of truth may come up to `_lead_s` after it.
         """
         source, lead_ns = self.inputs.by_name[name], round(self._lead_s(name) * NS)
         latest = self.latest_of(source.topic, source.max_age_s, lead_ns=lead_ns)
@@ -89,7 +89,7 @@ class AlignedInputs:
     ) -> LatestMessages:
         """Return a topic's latest message up to `lead_ns` after each tick.
 
-        With `keep` (N,), only among these messages.
+        With `keep` (N,), messages for which it is False are skipped.
         """
         parts = []
         for segment, stamps in zip(self.segments, self.ticks, strict=True):
@@ -101,7 +101,7 @@ class AlignedInputs:
         return LatestMessages.join(parts)
 
     def camera_frames(self) -> dict[str, CameraFrames]:
-        """Return the frames of each recorded camera, and those in force at the ticks, by name."""
+        """Return, for each recorded camera, its frames and which of them each tick uses."""
         found: dict[str, CameraFrames] = {}
         for name, camera in self.profile.cameras.items():
             columns = self.inputs.topics.get(camera.topic)
@@ -123,10 +123,10 @@ class AlignedInputs:
     def commanded_by(self) -> list[str | None]:
         """Return the source whose command is in force at each tick, or None.
 
-        A source is found for each command, among the messages up to the command's time. It is the
-        source whose last command is equal, the latest if there are several; otherwise one whose
-        button is pressed. A smoothed command equals no source's command, so it gets the source of
-        the last message of `command_through`, which it follows.
+        The source of a command is the one whose own last command up to then is equal to it. If
+        several are, it is the one that sent its command last; if none is, one whose button is
+        pressed. A smoothed command equals no source's command, so its source is that of the last
+        message of `command_through` before it.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
         through = self.profile.command_through
@@ -176,15 +176,15 @@ class AlignedInputs:
                 PoseSeries.of(one.stamp_ns, *(column[one.row] for column in columns))
                 for one in samples
             ]
-        assert self.tree is not None  # the profile is refused otherwise
+        assert self.tree is not None  # a profile without [inputs.pose] must have [frames]
         return poses_along(self.tree)
 
     def _lead_s(self, name: str) -> float:
-        """Return by how much an input's message may be later than its tick."""
+        """Return how long after a tick a message of this input may come and still belong to it."""
         half_s, by_rate = self.profile.task.control_period_s / 2, self.profile.clock.steps == "rate"
         leads = {
-            # At a fixed rate a command may come anywhere in the interval. The one in force at the
-            # middle is in force for most of it. With steps by command, it starts the interval.
+            # At a fixed rate, a command may come at any time after the tick. The one in force half
+            # a period later holds for most of the step. With steps by command, it starts the step.
             "command": half_s if by_rate else 0.0,
             "true_condition": half_s,  # the message nearest to the tick
             "true_exposure": half_s,
@@ -296,7 +296,7 @@ def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
 
 
 def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSegment]) -> None:
-    """Set `inputs.placed`: the poses of the frames of goals and plans, if not the fixed frame."""
+    """Set `inputs.placed`, the poses of frames other than the fixed one that goals or plans use."""
     fixed = plain(tree.frames.fixed)
     for name in ("goal", "plan"):
         frames = np.array([*inputs.frames_of(name), None], object)[:-1]
@@ -312,7 +312,7 @@ def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSeg
             rows = np.concatenate(
                 [one.row[keep] for one, keep in zip(samples, inside, strict=True)]
             )
-            # A latched message is repeated at the start of later segments; its first time counts.
+            # Later segments repeat a latched message; filled backwards, its first time counts.
             at.fill(rows[::-1], tree.place(frame, times), slice(None, None, -1))
 
 

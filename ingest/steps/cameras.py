@@ -29,7 +29,7 @@ from restock.ingest.task.schema import frame_schema, transition_ids
 
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 TYPES = (COMPRESSED, RAW)
-MAX_PIXELS = 100_000_000  # per frame; no camera has more
+MAX_PIXELS = 100_000_000  # largest size of a frame; no camera has more
 JPEG, PNG = "jpeg", "png"
 # Encoding of raw images -> NumPy type, number of channels, and the channels' order that gives red,
 # green, blue (and alpha).
@@ -50,11 +50,11 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type -> channels; a palette (3) has RGB
 _PLAIN_MODES = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LA": "RGBA", "1": "L"}
-_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers that begin a frame header
 
 
 class ImageProblem(ValueError):
-    """A message has no image that can be kept; the text is a reason by which they are counted."""
+    """A message has no image that can be kept; such messages are counted by this error's text."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class ImageLayout:
     height: int
     channels: int
     bits: int  # per channel
-    row_bytes: int = 0  # for raw images
+    row_bytes: int = 0  # bytes per row of a raw image; 0 for JPEG and PNG
     big_endian: bool = False
 
 
 def compressed_layout(data: bytes, message_format: str) -> ImageLayout:
-    """Read the layout of a JPEG or PNG file from its header; `message_format` is for errors.
+    """Read the layout of a JPEG or PNG from its header; only errors mention `message_format`.
 
     Raises:
         ImageProblem: the file is neither, its header is damaged, or its end is missing.
@@ -162,7 +162,7 @@ def _jpeg(data: bytes) -> ImageLayout:
         if data[at] != 0xFF:
             break
         marker = data[at + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:  # no length follows
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without a length field
             at += 1 if marker == 0xFF else 2
             continue
         if marker in _JPEG_FRAMES:
@@ -185,7 +185,7 @@ def _png(data: bytes) -> ImageLayout:
     return ImageLayout(PNG, width, height, _PNG_CHANNELS[color], 8 if color == 3 else bits)
 
 
-# Columns computed from frames. Their names have spaces, unlike names of the message's fields.
+# Names of columns computed from frames. They have spaces, so as not to clash with field names.
 ENCODING, PROBLEM, SHA256 = "frame encoding", "frame problem", "frame sha256"
 SIZE, WIDTH, HEIGHT = "frame size_bytes", "frame width", "frame height"
 CHANNELS, BITS, ROW_BYTES = "frame channels", "frame bits", "frame row_bytes"
@@ -201,10 +201,7 @@ def image_fields(kind: str) -> tuple[str, ...]:
 
 
 def wrong_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
-    """Return the first field that is missing or differs from ROS's definition of this type.
-
-    None if there is no such field.
-    """
+    """Return the first field that is missing or not as ROS defines it; None if all are right."""
     found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
     fields = image_fields(kind)
     return next((name for name in fields if not _is_field(name, found.get(name))), None)
@@ -258,7 +255,7 @@ def image_bytes(fields: Fields) -> list[bytes]:
 
 
 def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
-    """Return a function from row and bytes to the image's layout; it raises ImageProblem."""
+    """Return a function (row, image bytes) -> the image's layout, which raises ImageProblem."""
     if kind == COMPRESSED:
         formats = np.asarray(fields["format"], object)
         return lambda row, data: compressed_layout(data, str(formats[row]))
@@ -275,7 +272,7 @@ def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
 
 NS = 1_000_000_000
 OFF_CLOCK = "its stamp does not fit the clock"
-MAX_REASONS = 20  # reasons counted separately, as every message could have another one
+MAX_REASONS = 20  # the most frequent reasons are counted one by one, all others together
 
 
 @dataclass(frozen=True)
@@ -285,7 +282,7 @@ class CameraFrames:
     camera: Camera
     columns: TopicColumns  # layouts and hashes, by `frame_reduction`
     stamp_ns: Ints  # (N,) on the alignment clock; -1 if the stamp does not fit the clock
-    usable: Bools  # (N,) whether it is an image, on the clock, and not thinned out
+    usable: Bools  # (N,) whether an image was read, its stamp fits, and `max_hz` keeps it
     at_tick: Ints  # (T,) index of the last usable frame that is not too old, or -1
 
     @property
@@ -310,7 +307,7 @@ class CameraFrames:
         return frames, first, last
 
     def account(self, kept: int, steps: int) -> dict[str, Any]:
-        """Count the decoded messages by outcome: kept, thinned, unused and problems add up."""
+        """Count the decoded messages as kept, thinned, unused or problems: each is one of these."""
         problems = self.problems
         usable, decoded = int(self.usable.sum()), len(self.columns)
         return {
@@ -337,7 +334,7 @@ def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: floa
     return usable
 
 
-BATCH_BYTES = 32 << 20  # size of images from which a batch of rows is written
+BATCH_BYTES = 32 << 20  # a batch of rows is written once its images reach this size
 
 
 @dataclass(frozen=True)
@@ -348,12 +345,12 @@ class KeptFrames:
     frames: CameraFrames
     row: Ints  # (K,) ascending
     first: Ints  # (K,) first tick at which the frame is in force
-    last: Ints  # (K,) last such tick
+    last: Ints  # (K,) last tick at which it is
     steps: int  # number of steps with a frame
 
     @classmethod
     def of(cls, name: str, frames: CameraFrames, ticks: Ints) -> KeptFrames:
-        """Choose frames for `ticks`, the steps that belong to an episode, in any order."""
+        """Keep the frames in force at `ticks` (in any order), the steps that are in an episode."""
         ticks = np.unique(ticks)
         return cls(name, frames, *frames.in_force(ticks), int((frames.at_tick[ticks] >= 0).sum()))
 

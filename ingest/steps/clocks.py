@@ -34,9 +34,9 @@ class TopicClock:
     messages: int
     publish_offset_ns: int | None  # log time - publish time, median; None without a message
     offset_ns: int | None = None  # log time - header stamp, median over nonzero stamps
-    spread_ns: int | None = None  # … 1st to 99th percentile
-    jumps: int | None = None  # how often this difference changes by more than JUMP_S
-    backsteps: int | None = None  # stamps lower than that of the message received just before
+    spread_ns: int | None = None  # log time - header stamp, 1st to 99th percentile
+    jumps: int | None = None  # how often log time - header stamp changes by more than JUMP_S
+    backsteps: int | None = None  # number of stamps below that of the message received before
     duplicates: int | None = None  # messages that repeat the stamp of another message
     zero_stamps: int | None = None
 
@@ -46,7 +46,7 @@ class TopicClock:
 
 
 def topic_clock(topic: str, columns: TopicColumns) -> TopicClock:
-    """Compare one topic's clocks. Its messages are in the order of log time."""
+    """Compare one topic's clocks; `columns` must be in the order of log time."""
     log, publish = columns.log_time_ns, columns.publish_time_ns
     count = len(log)
     sent = median(log - publish) if count else None
@@ -94,7 +94,7 @@ def odd(row: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-_BLOCK = 1 << 16  # windows sorted at a time: bounds memory
+_BLOCK = 1 << 16  # number of windows sorted at a time, to limit memory
 
 
 def topic_clocks(topics: Mapping[str, TopicColumns]) -> list[TopicClock]:
@@ -165,7 +165,7 @@ class ClockMap:
         return cls(log[last], stamp[last])
 
     def stamped(self, log_ns: Ints) -> Ints:
-        """Convert log times (N,) to stamped times (N,); beyond the knots at the map's mean pace."""
+        """Convert log times (N,) to stamped times (N,); outside the knots, at the mean pace."""
         # Only differences are converted to float64, which would round epoch times to 256 ns.
         first, last = int(self.log_ns[0]), int(self.log_ns[-1])
         start = int(self.stamp_ns[0])
@@ -181,7 +181,7 @@ class ClockMap:
         """Convert stamped times (N,) to log times (N,): the inverse of `stamped`."""
         if self.is_constant or not self.pace:
             return stamp_ns + self.offset_ns
-        last = np.append(np.diff(self.stamp_ns) > 0, True)  # among equal stamps, the latest
+        last = np.append(np.diff(self.stamp_ns) > 0, True)  # of equal stamps, the last log time
         return ClockMap(self.stamp_ns[last], self.log_ns[last]).stamped(stamp_ns)
 
     def ahead_by(self, shift_ns: int) -> ClockMap:
@@ -225,10 +225,10 @@ def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
 
 
 def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
-    """Return the distance of messages with both times (N,) from a map through their neighbours.
+    """Return the error of a map through N messages at messages between its knots, (N,) ns.
 
-    Every other message is compared with a map through the rest, and the reverse, so the spread is
-    the error for a message between two knots. Empty for fewer than 4 messages.
+    A map through every other message is compared with the rest, and the reverse. Empty for fewer
+    than 4 messages.
     """
     if len(log_ns) < 4:
         return np.zeros(0, np.int64)

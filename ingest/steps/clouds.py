@@ -21,12 +21,12 @@ from restock.ingest.profile.tables import Input
 BEAM_RAD = np.pi / 360  # angle between two beams
 _FIELDS = ("fields[].name", "fields[].offset", "fields[].datatype")
 _SHAPE = ("height", "width", "point_step", "row_step", "is_bigendian")
-CLOUD_PATHS = (*_FIELDS, *_SHAPE, "data")  # of a sensor_msgs/msg/PointCloud2
+CLOUD_PATHS = (*_FIELDS, *_SHAPE, "data")  # fields read of a sensor_msgs/msg/PointCloud2
 _FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
 
 
 def cloud_reduction(source: Input, range_min_m: float) -> Reduction:
-    """Build the reduction of clouds to scans, in the fields that `source` names.
+    """Build the reduction of clouds to scans, whose columns are named by `source.fields`.
 
     A cloud without any point at `range_min_m` or farther gets NaN ranges, like a lidar that sees
     nothing. A cloud that cannot be decoded gets a NaN angle.
@@ -65,7 +65,7 @@ def points_of(fields: Fields, row: int) -> F64 | None:
     short = (height - 1) * row_step + width * step > len(data)
     if layout is None or short or (height > 1 and row_step < width * step):
         return None
-    rows = (row_step, step)  # rows of an organised cloud, and points, may be padded
+    rows = (row_step, step)  # strides in bytes: rows and points may be padded
     table: NDArray[Any] = np.ndarray((height, width), layout, data.data, strides=rows)
     return np.stack([table[axis].ravel().astype(np.float64) for axis in "xyz"])
 
@@ -99,7 +99,7 @@ def _scan(source: Input, points: F64, range_min_m: float, low: float, beams: int
     bottom, top = source.height_m or (-np.inf, np.inf)
     up = -z if source.upside_down else z
     beam = np.floor((np.arctan2(y, x) - low) / BEAM_RAD).astype(np.int64)
-    beam[beam == beams] -= 1  # a point exactly at the last bearing
+    beam[beam == beams] -= 1  # a point at exactly the last bearing belongs to the last beam
     kept = there & (bottom <= up) & (up <= top) & (beam >= 0) & (beam < beams)
     np.minimum.at(scan, beam[kept], far[kept].astype(np.float32))
     return scan

@@ -22,19 +22,19 @@ from restock.ingest.task.task import Signals, wrap_angle
 
 WINDOW_S = 3.0  # length of the windows in which two sources of a speed are compared
 MIN_WINDOWS = 5  # fewest windows with motion; fewer are no evidence
-APART = 1.25  # ratio of two speeds that is a contradiction, if in three of four windows
+APART = 1.25  # two speeds contradict if they differ by this factor in three of four windows
 STILL = 0.05  # a ratio below this means that the source stays at 0
 MOVES = 0.2  # the robot moves in a window if its mean speed is above this * the fastest command
 TURNS_RAD = 0.3  # smallest turn in a window in which yaw rates are compared
-STEPS_PER_WINDOW = 2 / 3  # share of a window's time that must be known
-BEYOND, BEYOND_MPS = 1.5, 0.1  # factor and margin above the fastest command or wheel speed
+STEPS_PER_WINDOW = 2 / 3  # share of a window's time that joined steps must cover
+BEYOND, BEYOND_MPS = 1.5, 0.1  # poses jump above BEYOND * fastest command or wheel + BEYOND_MPS
 OFTEN = 0.02  # share of the steps, or messages, from which a problem is reported
-SPIKE = 3.0  # factor above what commands and poses reach
-SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # above that: a robot may be carried
-SPIKES = 0.1  # largest share of messages that are spikes; more mean another scale
+SPIKE = 3.0  # a spike is above SPIKE * the fastest command or pose + SPIKE_MARGIN
+SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # as a robot may be carried
+SPIKES = 0.1  # largest share of messages that are spikes; if more are, the scale is wrong
 MIN_STEPS = 5
-JUMP_M = 0.2  # shortest step of a jumping pose; less may be the localiser's noise
-LEADS, SURE = 0.03, 0.8  # smallest gain in correlation, and smallest correlation, for a lead
+JUMP_M = 0.2  # a jump is this much farther than possible; less may be the localiser's noise
+LEADS, SURE = 0.03, 0.8  # motion is early if an earlier lag correlates by LEADS better, above SURE
 MAX_LEAD_S = 1.0
 MIN_FOLLOWED = 150  # fewest steps to correlate: in fewer, unrelated motions may look alike
 
@@ -69,9 +69,9 @@ class Drive:
     """The signals of a recording's T steps, divided into W windows for comparisons."""
 
     signals: Signals
-    joined: Bools  # (T,) usable, as is the step before, in the same clock segment
+    joined: Bools  # (T,) whether this step and the one before are usable, without a gap or jump
     seconds: F64  # (T,) since the step before; 0 if not joined
-    window: Ints  # (T,) index of the window of WINDOW_S
+    window: Ints  # (T,) index of the step's window, which lasts WINDOW_S
 
     @classmethod
     def of(cls, signals: Signals, segment: Ints, problem: Sequence[str], longest_s: float) -> Drive:
@@ -229,7 +229,7 @@ def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
 
 
 def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: int) -> list[Finding]:
-    """Find a source that differs from the poses in one direction in three of four windows.
+    """Find a source that is above the poses, or below them, in three of four windows.
 
     `windows` are the values of source and poses; `of` are the finding's kind and topic, the
     compared quantity, and the poses' topic.
@@ -307,7 +307,7 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
         by_lag, most = _by_lag(requested, motion, drive.joined, period_s)
         best = int(np.argmax(by_lag))
         lead = most - best  # steps by which the motion is early
-        # One step is no evidence: a command may be sent when the motion of its step is over.
+        # A lead of one step is no evidence: a command may be sent at the end of its step.
         if lead > 1 and by_lag[best] > max(SURE, max(by_lag[most:]) + LEADS):
             return [
                 Finding(
@@ -344,6 +344,6 @@ def _correlation(requested: F64, motion: F64, joined: Bools, lag: int) -> float:
         return -1.0
     pair -= pair.mean(axis=1, keepdims=True)
     (own, shared), (_, other) = (pair @ pair.T).tolist()
-    if min(own, other) < 1e-6 * pair.shape[1]:  # a standard deviation of 1e-3
+    if min(own, other) < 1e-6 * pair.shape[1]:  # standard deviation below 1e-3
         return -1.0
     return float(shared / np.sqrt(own * other))

@@ -33,9 +33,9 @@ class CustomColumn:
     """A custom signal's values in the N messages of its topic."""
 
     signal: CustomSignal
-    values: Ragged  # (N,) for a signal that is not a list: one value per message, or none
-    unread: Sequence[str] = ()  # a text that is not a number, of each message with any
-    unmeasured: int = 0  # number of messages that mark it as not measured
+    values: Ragged  # (N,) lists; if the signal is not a list, each holds one value or none
+    unread: Sequence[str] = ()  # from each message with texts that are no numbers, one of them
+    unmeasured: int = 0  # number of messages that mark the signal as not measured
 
     @cached_property
     def samples(self) -> NDArray[np.bool_]:
@@ -76,8 +76,8 @@ class CustomColumn:
         rows = self.values.take(message[known])
         values = np.asarray(rows.values, np.float32)
         flat = pa.array(values, pa.float32(), mask=~np.isfinite(values))
-        offsets = np.zeros(len(message) + 1, np.int32)  # a null must have length 0, or writing
-        offsets[1:][known] = rows.lengths  # Parquet may fail
+        offsets = np.zeros(len(message) + 1, np.int32)
+        offsets[1:][known] = rows.lengths  # a null keeps length 0, or writing Parquet may fail
         offsets = np.cumsum(offsets, dtype=np.int32)
         return pa.ListArray.from_arrays(pa.array(offsets), flat, type=LIST, mask=pa.array(~known))
 
@@ -85,7 +85,7 @@ class CustomColumn:
 def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] = ()) -> Reduction:
     """Build the reduction that computes the columns of these signals, all of one topic.
 
-    The topic's messages have the fields `has`.
+    `has` are all fields of the topic's messages.
     """
     fields = [path for signal in signals.values() for path in signal.wanted()]
     for signal in signals.values():
@@ -102,9 +102,9 @@ def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] =
 
 
 def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, FieldColumn]:
-    """Compute a signal's values in N messages, the texts that are not numbers, and flags.
+    """Compute a signal's columns in N messages: values, texts that are not numbers, and flags.
 
-    The flags mark messages in which it was not measured.
+    A flag marks a message in which the signal was not measured.
 
     Raises:
         RecordingError: the signal is not a number, or a list of numbers, per message.
@@ -148,13 +148,13 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
 
 
 def _mask_unmeasured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
-    """Replace values by NaN that messages mark as not measured."""
+    """Replace the values that messages mark as not measured by NaN."""
     markings = (read_element(columns, path)[read.message] for path in rule.marked_by)
     return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *markings))
 
 
 def _key(name: str) -> str:
-    """Return the column of a signal in its topic; it has a space, unlike names of fields."""
+    """Return the name of a signal's column; it has a space, so as not to clash with fields."""
     return f"signal {name}"
 
 
@@ -186,7 +186,7 @@ def _texts(values: NDArray[Any]) -> list[str]:
 
 
 def _reduce(read: PathValues, how: Reduce | None) -> PathValues:
-    """Reduce the finite elements of each message to one number; without any, it has no value."""
+    """Reduce the finite elements of each message to one number; a message without any has none."""
     finite = np.isfinite(read.values)
     values, owner = np.asarray(read.values[finite], np.float64), read.message[finite]
     message, start, counts = np.unique(owner, return_index=True, return_counts=True)
@@ -286,7 +286,7 @@ def latest_samples(aligned: AlignedInputs, column: CustomColumn) -> LatestMessag
 def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
     """Return a signal's values from its topic's columns."""
     fields: Fields = topic.fields
-    if _key(name) not in fields:  # whole messages, which the readers of recordings reduce
+    if _key(name) not in fields:  # the topic was read without its reduction
         fields = custom_reduction({name: signal}).apply(fields)
     values, texts = fields[_key(name)], fields.get(f"{_key(name)}, no number", np.zeros(0))
     assert isinstance(values, Ragged)
