@@ -76,7 +76,7 @@ def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
 
 
 def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
-    """Find corridors along the first axis: free runs of cells in columns, joined if sides agree."""
+    """Find corridors along the first axis: join free runs of cells in columns if sides agree."""
     low, high = WIDTH_M[0] / cell_m - 1e-6, WIDTH_M[1] / cell_m + 1e-6
     wander = EDGE_M / cell_m + 1e-6
     open_: list[tuple[_Corridor, int, int]] = []  # corridor, outermost low and high side so far

@@ -38,8 +38,8 @@ from restock.train.twin.floors.layout import (
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
-_TENTHS = {"train": 7, "validation": 1, "test": 2}  # of all seeds
-FLOORS = 16  # of a split, if no count is given
+_TENTHS = {"train": 7, "validation": 1, "test": 2}  # tenths of all seeds, by split
+FLOORS = 16  # number of floors of a split if no count is given
 MAX_FLOORS = 256
 MAX_SEED = 2**53 - 1
 
@@ -52,7 +52,7 @@ class Recipe:
 
     aisle_m: Range = (1.5, 2.3)  # width
     cross_m: Range = (2.0, 2.6)  # width of a cross-aisle
-    rack_m: Range = (2.4, 3.6)  # along the aisle
+    rack_m: Range = (2.4, 3.6)  # length of a rack along the aisle
     rack_deep_m: Range = (0.8, 1.4)
     aisles: tuple[int, int] = (3, 5)
     cross_aisles: tuple[int, int] = (3, 4)
@@ -132,7 +132,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
 def _strips(
     widths: list[float], recipe: Recipe, rng: np.random.Generator, way: Literal["deep", "long"]
 ) -> tuple[tuple[Range, ...], float]:
-    """Lay free strips with drawn rack sizes between them; return them and the last one's end."""
+    """Return free strips (start, end) with racks of drawn sizes between, and the last one's end."""
     span = recipe.rack_deep_m if way == "deep" else recipe.rack_m
     strips, at = [], 0.0
     for width in widths:

@@ -70,9 +70,9 @@ ELSEWHERE = "elsewhere"
 MIN_SIDE_M = 1.0
 MAX_SIDE_M = 60.0  # planning on a larger floor takes seconds
 MAX_RACKS = 400
-ROOM_M = 0.3  # minimum from the robot's middle to a rack: half the stand-in's width and a margin
+ROOM_M = 0.3  # minimum distance from robot's middle to racks: half the stand-in's width, and more
 WAY_M = (4.0, 11.0)  # shortest and longest route of a mission
-BAY_M = 0.6  # between the goals along an aisle
+BAY_M = 0.6  # distance between the goals along an aisle
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Rect:
 
 @dataclass(frozen=True)
 class AisleSegment:
-    """A part of an aisle between two cross-aisles. Pallets at one place in it close it.
+    """A part of an aisle between two cross-aisles. Pallets across it at any place close it.
 
     It runs along the axis `along`, between racks or walls on its two other sides.
     """
@@ -262,7 +262,7 @@ class Warehouse:
         """Return 12 hex digits that identify the floor, independently of its name."""
         content = asdict(self) | {"name": ""}
         for later, usual in (("room_m", ROOM_M), ("way_m", WAY_M), ("starts_m", ())):
-            if content[later] == usual:  # so that floors from before these fields keep their hash
+            if content[later] == usual:  # older floors, without the field, keep their hash
                 del content[later]
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
 

@@ -39,12 +39,12 @@ from restock.train.twin.floors.layout import (
 )
 from restock.train.twin.floors.planner import Planner
 
-SPACING_M = 0.5  # side of the squares that keep one place each
+SPACING_M = 0.5  # side of a square: of the places in it, only the widest is kept
 PLACES = 100  # maximum number of places
-SAMPLE = 12  # number of starts, and of goals, between which routes are measured, roughly
-OFTEN = 0.1  # on a large floor, at least this share of routes has a usual mission's length
-SHORTEST = 0.4  # on a smaller floor, the shortest mission as a share of the longest route
-NEAR_M = 3.0  # if visited places are no farther apart, missions go to other places, too
+SAMPLE = 12  # approximate number of starts, and of goals, between which routes are measured
+OFTEN = 0.1  # if fewer routes have a usual length (WAY_M), mission lengths are fitted to the floor
+SHORTEST = 0.4  # shortest of the fitted mission lengths, as a share of the longest route
+NEAR_M = 3.0  # if routes between visited places are shorter, missions go to other places, too
 NEAREST_M = 0.5  # shorter routes are not used as missions
 
 
@@ -140,7 +140,7 @@ def _measure_routes(floor: Warehouse) -> tuple[F64, F64]:
 
 
 def _with_lengths(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
-    """Return the floor with these lengths for missions, unless usual lengths are common enough."""
+    """Fit a floor's mission lengths to its routes (N,), unless enough are of usual length."""
     if not len(length):
         return floor
     low, high = WAY_M
@@ -185,7 +185,7 @@ class OccupancyGrid:
         return np.asarray(self.occupancy == FREE, np.bool_)
 
     def within(self, places_m: F64) -> F64:
-        """Convert places (N, 2) from the map's frame to the grid's, which begins at its corner."""
+        """Convert places (N, 2) from the map's frame to the grid's, with the grid's corner at 0."""
         return into_frame(places_m, self.origin)
 
     def at(self, places_m: F64) -> NDArray[np.int8]:
@@ -228,7 +228,7 @@ class GridFloor:
 
 
 def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Convert places (N, 2) from the map's frame to the frame at `origin` (x, y, yaw) in it."""
+    """Convert places (N, 2) from the map's frame to the frame with this origin (x, y, yaw)."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = (np.asarray(places_m, np.float64) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
@@ -236,7 +236,7 @@ def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
 
 
 def out_of_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Convert places (N, 2) from the frame at `origin` (x, y, yaw) back to the map's frame."""
+    """Convert places (N, 2) from the frame with this origin (x, y, yaw) to the map's frame."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = np.asarray(places_m, np.float64) @ np.array([[cos, sin], [-sin, cos]]) + (x, y)

@@ -26,7 +26,7 @@ PLACED = 0.8  # minimum share of poses on free ground
 # Minimum share of lidar returns within NEAR_M of a wall. Measured on real drives and the sample
 # logs: .78 to .98 on floors made from the same drives, up to .61 on floors of other frames.
 SEEN, NEAR_M = 0.7, 0.25
-MIN_RETURNS = 50  # fewer returns are ignored
+MIN_RETURNS = 50  # with fewer returns, their distances from walls are not checked
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
 
 
 def placed_on(floor: Warehouse, drive: Drive) -> bool:
-    """Return whether the frame of a drive's log is that of this floor's map; False if empty."""
+    """Return whether a drive's log is in the frame of this floor's map; False without positions."""
     if not len(drive.places_m):
         return False
     places, returns = (
@@ -72,8 +72,8 @@ def placed_on(floor: Warehouse, drive: Drive) -> bool:
 
 
 COMPARED = 64  # maximum number of recordings whose frames are checked
-ROWS = 2000  # maximum rows read of a recording, roughly
-WITHIN_M = 3.0  # maximum distance of returns from the lidar: farther away, a sector is wide
+ROWS = 2000  # approximate maximum of the rows that are read of a recording
+WITHIN_M = 3.0  # maximum distance of returns from the lidar: farther away, sectors are too wide
 RETURNS = 4000  # maximum returns of a drive
 _COUNTS = (
     "SELECT recording_id, count(*) FROM transitions WHERE list_contains(?, recording_id)"

@@ -24,10 +24,10 @@ from restock.train.twin.floors.layout import HEADINGS, ROOM_M, Warehouse
 
 CELL_M = 0.1
 PLAN_POINTS = 48
-WIDE_M = 0.85  # cells with this clearance cost just their length, for the stand-in
+WIDE_M = 0.85  # for the stand-in, a cell with at least this clearance costs just its length
 NEAR_COST = 3.0  # a cell whose clearance is the floor's `room_m` costs 1 + this times its length
 _TREES_KEPT = 2048
-_TREES_KEPT_BYTES = 1 << 29  # of all planners together that one call of `planners` makes
+_TREES_KEPT_BYTES = 1 << 29  # limit for the caches of all planners of a `planners` call
 
 Closure = tuple[int, int]  # aisle segment, and the position along it in steps of CLOSURE_STEP_M
 CLOSURE_STEP_M = 0.3
@@ -197,7 +197,7 @@ class Planner:
         return (across, along) if turned else (along, across)
 
     def _build_graph(self, clearance_m: F64) -> sparse.csr_matrix:
-        """Connect cells to their eight neighbours, at length times the mean cost of both ends.
+        """Connect cells to their eight neighbours; a weight is length × mean cost of both ends.
 
         Edges run against the robot's direction, because trees grow from the goal.
         """
@@ -217,7 +217,7 @@ class Planner:
             one, other = index[cells][both], index[neighbours][both]
             length = CELL_M * np.hypot(di, dj)
             weight = length * (cost[cells][both] + cost[neighbours][both]) / 2
-            # Edge one -> other is for a robot that drives from `other` to `one`, by (-di, -dj).
+            # A robot drives the edge one -> other from `other` to `one`, a step of (-di, -dj).
             kept = _find_allowed(rules, (-di, -dj), one, other)
             forth.append((one[kept], other[kept], weight[kept]))
             kept = _find_allowed(rules, (di, dj), one, other)
@@ -242,7 +242,7 @@ def _find_allowed(
     one: Ints,
     other: Ints,
 ) -> Bools:
-    """Return which edges a robot may drive in the direction `step`: not against one-way rules."""
+    """Return which edges a robot may drive in direction `step` without breaking one-way rules."""
     allowed = np.ones(len(one), np.bool_)
     for heading, inside in rules:
         if heading[0] * step[0] + heading[1] * step[1] < 0:

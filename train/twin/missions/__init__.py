@@ -23,6 +23,6 @@ def _find() -> dict[str, Mission]:
 
 MISSIONS: Mapping[str, Mission] = _find()
 KINDS = tuple(MISSIONS)
-# Default shares by kind: of episodes in training, and of missions at a site that runs well.
+# Shares by kind of mission: the default in training, and NATURAL, at a site that runs well.
 DEFAULT_CONDITIONS: Mapping[str, float] = {name: kind.share for name, kind in MISSIONS.items()}
 NATURAL: Mapping[str, float] = {name: kind.natural for name, kind in MISSIONS.items()}

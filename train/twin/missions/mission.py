@@ -49,7 +49,7 @@ class Mission:
     natural: float  # share of missions at a site that runs well
     colour: str  # in charts, from the palette of Okabe and Ito
     place: int  # kinds are sorted by place, then by name
-    is_true: Callable[[Situation], Bools] | None = None  # None: there is nothing to meet
+    is_true: Callable[[Situation], Bools] | None = None  # None: no obstacle is staged
     blocks: Mapping[str, str] = field(default_factory=dict)  # way to stage it -> colour in charts
     block_measures: Mapping[str, str] = field(default_factory=dict)  # measure of a study -> block
     needs_lidar: bool = False  # a robot without a lidar meets it only by driving into it
