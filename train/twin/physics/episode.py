@@ -33,10 +33,10 @@ Way = tuple[float, float, float, float, float]  # start x, y, yaw, goal x, y in 
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The settings that determine an episode. `perturbation` None is the environment's.
+    """The settings that determine an episode. Without `perturbation`, the environment's is used.
 
-    `layout` is the name of a floor; None is the environment's only floor, or one of its floors that
-    the seed draws. `way` is the start and goal; None: the seed draws them.
+    `layout` is the name of a floor; if it is None, the seed draws one of the environment's floors.
+    `way` is the start and goal; if it is None, the seed draws them.
     """
 
     condition: str
@@ -56,7 +56,7 @@ class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode as drawn."""
+    """An episode drawn from a spec: its start, goal, first plan, obstacles and noise."""
 
     spec: EpisodeSpec
     start: tuple[float, float, float]  # x, y, yaw

@@ -110,7 +110,7 @@ def _spec(timestep_s: float) -> Any:
     option.impratio = 10
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.noslip_iterations = 0
-    # With one robot and few boxes, both only cost time (8 % and 3 % of a step).
+    # With one robot and few boxes, both features only cost time (8 % and 3 % of a step).
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     return spec
@@ -121,7 +121,7 @@ def building_boxes(
 ) -> tuple[F64, F64]:
     """Return centres and half sizes (rack_slots + 4, 3) of racks and walls, in model order.
 
-    They are at least so high that the lidar sees them.
+    The boxes are high enough for the lidar to see them.
     """
     thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
     rack_z_m, wall_z_m = (
@@ -233,7 +233,7 @@ TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5
 MAX_TILT_RAD = 0.05
 MIN_OUTSIDE_M = 0.01  # smaller overhangs are not reported
-TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, but at most half the robot's limits
+TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s of test drives; at most half the robot's limits
 
 
 def robot_model(robot: Robot | None, body: Body) -> RobotModel:

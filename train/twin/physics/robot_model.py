@@ -99,7 +99,7 @@ def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
 
 
 WHEEL_RADIUS_M = 0.10  # of the stand-in, like all constants up to REST_Z_M
-TRACK_M = 0.44  # between the wheels' contact points
+TRACK_M = 0.44  # distance between the wheels' contact points
 CASTER_RADIUS_M = 0.04
 CASTER_X_M = 0.27
 CASTER_KG = 0.5
@@ -116,7 +116,7 @@ ACCEL_LIMIT = (4.0, 10.0)  # m/s2 and rad/s2
 REST_Z_M = 0.09756  # height of the chassis frame at rest
 
 USUAL_ACCEL = (2.5, 6.0)  # default limits, m/s2 and rad/s2
-STIFF = 8.0  # factor on motors' gain if wheels scrub, which takes torque at the commanded speed
+STIFF = 8.0  # factor on motors' gain if wheels scrub: they need torque even at the set speed
 SCRUB = 1.5  # factor on motors' torque limit if wheels scrub
 USUAL_STEERING_RADPS = 2.0  # default limit of the steering rate
 

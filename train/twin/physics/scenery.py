@@ -42,10 +42,10 @@ from restock.train.twin.physics.robot_model import OBSTACLE_GROUP
 
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for a forklift in gaps to robots
 YIELD_M = 0.5  # gap at which an attentive agent stops
-STANDING_M = 0.15  # gap at which an inattentive agent stops before a robot that stands or backs off
+STANDING_M = 0.15  # gap at which an inattentive agent stops, unless the robot drives at it
 RETREAT_M = 2.0  # distance from the robot at which a retreat ends
 DRIVEN_AT_MPS = 0.15  # a robot that closes in faster than this drives at someone
-WAIT_S = 2.0  # then an agent retreats
+WAIT_S = 2.0  # an agent that a robot has stopped for longer retreats
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 _TRUCK_HALF_M = FORKLIFT_HALF_M[:2]
 _EACH = np.arange(AGENTS)
@@ -66,7 +66,7 @@ class Traffic(Stateful):
         self.body_half_m = np.array(body_half_m)
         self.radius_m = np.array([PERSON_RADIUS_M] * PEOPLE + [FORKLIFT_RADIUS_M] * FORKLIFTS)
         circle_m = [PERSON_RADIUS_M] * PEOPLE + [float(np.hypot(*_TRUCK_HALF_M))] * FORKLIFTS
-        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # centres beyond it: no touch
+        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # farther centres: no contact
         # Smallest gap to the robot's outline in the episode so far: inf if nobody is there, NaN if
         # it is not measured, because measuring takes time.
         self.closest_m = np.full(num_envs, np.nan)
@@ -281,7 +281,7 @@ class Scenery(Stateful):
 
         It moves a little at every substep: one jump per block would strike the robot like a hammer.
         """
-        self.stand_still(self.walked)  # in case it moves no more
+        self.stand_still(self.walked)  # else traffic that stops now would repeat its last moves
         self.walked = ids
         if not len(ids):
             return

@@ -41,9 +41,9 @@ from restock.train.twin.physics.robot_model import LIDAR_Z_M, stand_in
 from restock.train.twin.physics.scenery import Lidar
 from restock.train.twin.physics.simulation import Simulation
 
-FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: timestamps are never 0
+FIRST_STAMP_NS = 1_000_000_000  # timestamp of an episode's first step: timestamps are never 0
 DRIFT_TIME_S = 3.0  # time constant of the localisation's drift
-WIDEST_GAP_RAD = np.radians(20)  # beams this near to each other miss nothing
+WIDEST_GAP_RAD = np.radians(20)  # if neighbouring beams are closer than this, no obstacle is missed
 DRAWN = 60  # steps of an episode whose noise is drawn together
 _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 
@@ -63,12 +63,12 @@ class Sensing(Stateful):
         self._true_room = None if _sees_everything(simulation) else _TrueRoom(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
-        self._drawn = np.full(num, steps)  # steps whose noise is drawn; all of them until a reset
+        self._drawn = np.full(num, steps)  # number of steps with drawn noise; all before a reset
         self._generators = [np.random.default_rng(0)] * num
-        self._drift = np.zeros((num, 2))  # of the localised x and y, at the last drawn step
+        self._drift = np.zeros((num, 2))  # drift of localised x and y at the last drawn step
         self._scale = np.zeros((num, _SCALARS))
         self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
-        self._scan_every = np.ones(num, np.int64)  # steps
+        self._scan_every = np.ones(num, np.int64)  # steps from scan to scan
         self._pose_every = np.ones(num, np.int64)
         self.pose = np.zeros((num, 3))  # last localised pose
         self.pose_stamp_ns = np.zeros(num, np.int64)  # timestamp of that pose

@@ -108,7 +108,7 @@ class BaseController(Stateful):
         return self.commands[rows, first][:, None], self.commands[rows, last][:, None], reach
 
     def _find_change(self, since_s: float) -> tuple[Ints, Ints, tuple[Bools, F64, F64]]:
-        """Return the ages (N,) of both commands, in periods, and the rest of `_find_commands`.
+        """Return the results of `_find_commands`, with ages (N,) in periods instead of commands.
 
         The command changes at most once within a block.
         """
@@ -117,7 +117,7 @@ class BaseController(Stateful):
         age = np.clip(-np.floor(age_s / self._period_s), 0, self.commands.shape[1] - 1)
         age = age.astype(np.int64)  # (N, S) age of the command in force, in periods
         first, last = age[:, 0], age[:, -1]
-        former = (age == first[:, None])[..., None]  # all substeps if the command does not change
+        former = (age == first[:, None])[..., None]  # all, if the command stays
         switch, count = former.sum(axis=1, keepdims=True), (step + 1)[:, None]
         reach = self._accel_limit * self._timestep_s
         to_old, to_new = np.minimum(count, switch), np.maximum(count - switch, 0)
@@ -237,7 +237,7 @@ class RobotBody:
             wheels = zip(self.handles.wheel_bodies, self.robot.wheels_m[:, 1], strict=True)
             for body, y in wheels:
                 place[env, body, 1] = y * perturbation.track_scale
-                # So that the casters keep their share of the load.
+                # Move the wheel up by as much as its radius grows: the casters keep their load.
                 place[env, body, 2] = self.model.body_pos[body, 2] + radius - nominal
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
