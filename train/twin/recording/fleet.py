@@ -52,8 +52,8 @@ FLEET = {"planner 1": 0.70, "planner 2": 0.18, f"operator {Operator.version}": 0
 VERSIONS = {driver.name: driver.version for driver in (PlannerFollower, Operator, RandomPolicy)}
 BLOCK = 20  # missions drawn at a time, so that a short recording has every condition, too
 
-PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
-MAX_DRIVEN = 3  # maximum missions driven per ordered one, if some do not meet their kind
+PAUSE_S = (4.0, 12.0)  # pause between missions, which is not recorded
+MAX_DRIVEN = 3  # maximum of missions driven per ordered mission, if some do not meet their kind
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ class BehaviourPolicies:
     def _make(self, name: str, version: str, handover: bool) -> BehaviourPolicy:
         if self._external is not None:
             return self._external
-        seed = self._seed * 16 + len(self._drivers)  # another one for every driver
+        seed = self._seed * 16 + len(self._drivers)  # differs by driver
         if name == "random":
             return RandomPolicy(seed=seed)
         if name == "operator":
@@ -325,7 +325,7 @@ class BehaviourPolicies:
         return Handover(planner, Operator(seed=seed, **self._epsilon)) if handover else planner
 
 
-ROBOTS = 8  # at a time
+ROBOTS = 8  # number of robots that drive at a time
 MOTION_PERIOD_S = 0.02
 
 
@@ -353,7 +353,7 @@ class _Log:
     rng: np.random.Generator  # for the noise of scans between ticks
     pallets: F64  # (P, 3)
     patches: F64  # (K, 5)
-    motion: list[BodyState]  # of all robots
+    motion: list[BodyState]  # true states of all robots since the mission began
     signals: list[dict[str, Any]] = field(default_factory=list)  # T + 1 rows
     observation: list[F32] = field(default_factory=list)  # T + 1
     action: list[int] = field(default_factory=list)

@@ -35,7 +35,7 @@ LIDAR_LSB_M = 2.0**-9  # about 2 mm
 PLANNING_S = (0.005, 0.007)  # from a tick to the navigation stack's proposal
 THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any other topic's delay
 BUMPER_POLL_S = 0.02
-JITTER_S = 4e-4  # of a sensor's timer
+JITTER_S = 4e-4  # maximum jitter of a sensor's timer, early or late
 TICK_TOLERANCE_S = 1e-6
 
 
@@ -149,7 +149,7 @@ class Robot:
         for start_s, until_s, (_, points) in zip(
             starts, [*starts[1:], end_s], drive.plans, strict=True
         ):
-            # Exclude `until_s`, when the next plan is sent, even if rounding moves a time past it.
+            # Exclude `until_s`, when the next plan is sent, even if `arange` would round to it.
             until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
             times = np.arange(start_s, until_s, 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]

@@ -90,10 +90,10 @@ class RecordingPlan:
 
     format: Format = "mcap"
     minutes: float | None = None
-    missions: int | MissionsFile | None = None  # a file's: until they have met their kinds
+    missions: int | MissionsFile | None = None  # a file: until its missions have met their kinds
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
-    policy: str = HANDOVER  # or planner, operator, random, or the policy given to `record`
+    policy: str = HANDOVER  # the fleet; or planner, operator, random, or the name of a given policy
     epsilon: float | None = None  # share of random actions; None: each driver's default
     rates: Rates = field(default_factory=Rates)
     hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
@@ -295,7 +295,7 @@ def record(
                 static = robot.static(start_ns, occupied, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
                 sink.write(static)
                 summary.topics.update(message.topic for message in static)
-            start_ns += 50_000_000  # after the latched messages, or the pause
+            start_ns += 50_000_000  # 50 ms after the latched messages or the pause
             messages = robot.publish(driven.drive, start_ns)
             sink.write(messages)
             summary.topics.update(message.topic for message in messages)
