@@ -47,8 +47,8 @@ from restock.train.twin.survey.poses import (
 )
 
 TYPE = "nav_msgs/msg/OccupancyGrid"
-FREE_BELOW, OCCUPIED_ABOVE = 25, 65  # percent
-_OTHERS = ("costmap", "cost_map", "transformed", "local", "_updates")  # in names of other grids
+FREE_BELOW, OCCUPIED_ABOVE = 25, 65  # occupancy in percent
+_OTHERS = ("costmap", "cost_map", "transformed", "local", "_updates")  # in topics of other grids
 _INFO = (
     "info.resolution",
     "info.width",
@@ -120,9 +120,9 @@ class StoredDrive:
     """The drive of one recording of a store, and those of the others with the same profile."""
 
     poses: Poses
-    everywhere: Poses  # of all recordings with this profile; in one frame if they share a map
+    everywhere: Poses  # of all recordings with this profile; in one frame only if they share a map
     recording: Path | None  # its file; None if that no longer exists
-    profile: Profile | None  # that its rows were ingested with; None if unreadable
+    profile: Profile | None  # the profile of its ingest; None if unreadable
     others: Mapping[str, Drive]  # source -> drive, of the largest other recordings
     notes: list[str] = field(default_factory=list)
 
@@ -247,7 +247,7 @@ def gather(
         free_on = _free_on(known)
         poses = own = choose_poses(candidate_poses(recording, profile), free_on)
         if with_map and known and stored is not None and _is_on_map(stored.everywhere, free_on):
-            poses = stored.everywhere  # all recordings lie on this map, so they share its frame
+            poses = stored.everywhere  # all of them lie on this map, so they are in its frame
         size = _profile_footprint(profile) or footprint_of(descriptions(recording))[0]
         scans: list[PlacedScans] = []
         if with_scans and own is not None:
@@ -281,7 +281,7 @@ def _profile_footprint(profile: Profile | None) -> Footprint | None:
 
 
 def _free_on(known: tuple[OccupancyGrid, str] | None) -> Callable[[F64], Bools]:
-    """Return a function that tests whether places (N, 2) are free on the map; all without one."""
+    """Return a function that tests which places (N, 2) are free on the map, or all without map."""
 
     def on_map(places_m: F64) -> Bools:
         if known is None:

@@ -50,10 +50,10 @@ from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M, RETURNS, WITHI
 from restock.train.twin.survey.poses import JUMP_M, Poses, Times, shared_clock
 
 BEAMS = 360  # scans with twice as many beams or more are thinned to about this number
-SCANS = 3000  # most scans of a recording that are used
-MOVED_M, TURNED_RAD, WAITED_S = 0.05, 0.05, 2.0  # a scan is used if one of these has passed
+SCANS = 3000  # maximum number of scans that are used of a recording
+MOVED_M, TURNED_RAD, WAITED_S = 0.05, 0.05, 2.0  # a scan is used after this much motion or time
 FAST_RADPS = 0.6  # scans during faster turns are left out
-_LIMITS = ("range_min", "range_max")  # fields that a type of scan may have
+_LIMITS = ("range_min", "range_max")  # fields that only some types of scan have
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def placed_scans(
 ) -> list[PlacedScans]:
     """Place a recording's lidar scans on the map, once per clock shared with the poses.
 
-    Header stamps come first, then log time, as the clocks of two computers may differ. The result
-    is empty if there are no scans, or none can be placed.
+    Scans placed by header stamp come first, then scans placed by log time, as two computers' clocks
+    may differ. The result is empty if there are no scans, or none can be placed.
     """
     fit = _scan_topic(recording, profile)
     if fit is None:
@@ -95,7 +95,7 @@ def placed_scans(
     frame = scans_of(recording, [fit])[topic].frame
     turn, place = _mount(recording, frame, profile, footprint, notes)
     first, last = (np.asarray(columns.fields[path], np.float64) for path in angles)
-    if "angle_max_rad" in kind.fields:  # `last` is a bearing, not the increment
+    if "angle_max_rad" in kind.fields:  # then `last` is the last bearing: make it the step
         last = (last - first) / np.maximum(np.asarray(columns.fields["count"]) - 1, 1)
     times = Times.of(columns)
     clocks = [True, False] if shared_clock(poses.times, times) else [False]
@@ -321,7 +321,7 @@ def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
 
 
 CORRIDOR_CELL_M = 0.05
-MARGIN_M = 0.25  # around the circle in which the robot turns
+MARGIN_M = 0.25  # free floor around the circle in which the robot turns
 
 
 def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
@@ -349,7 +349,7 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
 
 
 def way_between(places_m: F64) -> F64:
-    """Append points to places (N, 2), under a cell apart, between successive ones; not in jumps."""
+    """Append points, under a cell apart, between successive places (N, 2), except across jumps."""
     parts = [places_m]
     length = np.hypot(*np.diff(places_m, axis=0).T)
     for index in np.flatnonzero((length > CORRIDOR_CELL_M / 2) & (length <= JUMP_M)):
@@ -386,11 +386,11 @@ def _wall_middles(grid: OccupancyGrid) -> F64:
 
 CELL_M = 0.05
 REACH_M = 8.0  # beams are cut there, as farther points are less exact than a cell
-HIT, MISS = 0.9, -0.5  # changes of log-odds
+HIT, MISS = 0.9, -0.5  # changes of a cell's log-odds if a beam ends in it, and if one passes it
 MOST = 4.0  # largest absolute log-odds
 FREE_BELOW, OCCUPIED_ABOVE = -0.9, 0.6
-_APART = 4  # beams between two ends that give a wall's direction; closer ends are mostly noise
-_WALL_STEP_M = 0.6  # longest distance between two such ends on one wall
+_APART = 4  # a wall's direction is measured between ends this many beams apart: less is noise
+_WALL_STEP_M = 0.6  # if such ends are farther apart, they are not on one wall
 
 
 def scan_map(

@@ -30,9 +30,9 @@ from restock.ingest.steps.input_columns import fixes_of
 from restock.ingest.task.task import yaw_of
 
 MAX_APART_NS = 1_000_000_000  # longest time from an interpolated pose to the nearest on each side
-JUMP_M = 1.0  # over longer distances between two poses the robot was carried or relocalised
-WELL_PLACED = 0.9  # share of the poses on free floor
-FURTHEST_M = 1e5  # from the median pose; poses beyond are faulty
+JUMP_M = 1.0  # if two poses are farther apart, the robot was carried or relocalised
+WELL_PLACED = 0.9  # poses are trusted if at least this share is on free floor
+FURTHEST_M = 1e5  # poses that are farther from the median pose are faulty
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Times:
 
 
 def shared_clock(one: Times, other: Times) -> bool:
-    """Return whether both have stamps of one clock: most of `other`'s lie in the span of `one`."""
+    """Return whether both are stamped by one clock: most stamps of `other` are in `one`'s span."""
     if not (one.stamped and other.stamped):
         return False
     low, high = one.stamp_ns.min() - MAX_APART_NS, one.stamp_ns.max() + MAX_APART_NS

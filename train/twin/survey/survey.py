@@ -41,14 +41,14 @@ from restock.train.twin.survey.mapping import (
 from restock.train.twin.survey.poses import Poses
 
 Source = Literal["map", "scans", "corridor"]
-MARGIN_M = 0.05  # beyond half the body's width, when it drives along a wall
-TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
+MARGIN_M = 0.05  # distance between body and wall when the robot drives along it
+TURN_MARGIN_M = 0.07  # distance from the body's corners to walls when the robot turns
 STAND_IN = Footprint(0.7, 0.5, "the twin's default robot: the size of this robot is not known")
 MIN_BODY_M = 0.15
 MIN_SCANS = 8
-AGREEING, WELL_AGREEING = 0.5, 0.8  # shares of the scans' ends on walls of the combined map
-CLOCKS_APART = 0.1  # another clock is used if this share more agrees with it
-MAX_OFF = 0.5  # largest share of the poses off free floor, for a map to be theirs
+AGREEING, WELL_AGREEING = 0.5, 0.8  # scans' agreement to use a map, and to try no other clock
+CLOCKS_APART = 0.1  # another clock is used if its agreement is higher by this
+MAX_OFF = 0.5  # if a larger share of the poses is off free floor, the map is not theirs
 
 # Least share of lidar returns on a map's walls; with less, the poses are not in the map's frame.
 # Other people's robots with their own maps have .58 (badly localised) to 1.0.
@@ -60,7 +60,7 @@ class Surveyed:
     """A surveyed floor, its source, and notes for the user."""
 
     floor: Warehouse
-    grid: OccupancyGrid  # that the floor was made from
+    grid: OccupancyGrid  # the floor was made from this
     by: Source
     source: str  # for people
     footprint: Footprint
@@ -108,7 +108,7 @@ def survey(
         path: of the recording or store.
         recording: of a store, its ID or the end of its path; None: the one with the most rows.
         map_yaml: the map that the robot localised in; replaces one in the recording.
-        by: what to make the floor from; None: the first of map, scans and corridor that is there.
+        by: what to make the floor from; None: map, else scans, else the driven corridor.
         profile: defines the topics of pose and scan, and the robot's size; None: for a store, the
             profile that it was ingested with, else guesses.
         footprint: the robot's size; takes precedence over all other sources.
@@ -240,7 +240,7 @@ def _check_frames(
     """Check that the poses lie on the map; note the share that does not.
 
     Raises:
-        ConfigError: most poses do not.
+        ConfigError: most poses are off the map's free floor.
     """
     if poses is None:
         notes.append("the robot's pose is not known: missions start and end wherever there is room")
@@ -274,7 +274,7 @@ def _check_walls(
     """Check that the lidar's returns are on the map's walls; note it if many are not.
 
     Raises:
-        ConfigError: most returns are not.
+        ConfigError: most returns are not on walls.
     """
     by_clock = [returns_on_walls(one, grid) for one in scans]
     agree = max((share for share in by_clock if share is not None), default=1.0)
