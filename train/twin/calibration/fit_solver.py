@@ -389,7 +389,7 @@ class FitSolution:
     residual: F64  # (R,) in units of noise
     jacobian: F64  # (R, n)
     segment: NDArray[np.int64]  # (R,) index of each residual's segment
-    scale: dict[str, float]  # channel -> noise, including its correlation along segments
+    scale: dict[str, float]  # channel -> noise, scaled up for correlation along segments
     converged: bool
 
 

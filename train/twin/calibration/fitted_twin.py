@@ -68,7 +68,7 @@ class FittedTwin:
     estimates: tuple[ParameterEstimate, ...]
     warnings: tuple[str, ...]
     held_out: tuple[HeldOutGap, ...]
-    noise: dict[str, dict[str, Any]]  # channel -> its unit, and median deviation before and after
+    noise: dict[str, dict[str, Any]]  # channel -> unit, median deviations before and after fit
     segments: int  # number of fitted segments
     clusters: int  # number of episodes, or segments, that the bootstrap draws from
     left_out: dict[str, int] = field(default_factory=dict)  # reason -> how many left out

@@ -81,7 +81,7 @@ from restock.train.twin.physics.simulation import Simulation
 PAST = 5  # commands before the step that are replayed: longer than any latency and ramp
 AGREES = 0.05  # largest `agreement` if the floor is the log's: from noise and a few pallets
 SAME_M = 1e-3  # tolerance of a plan's remaining length, which is stored as float32
-SPACING_M = 0.02  # points closer to each other give no direction
+SPACING_M = 0.02  # spacing of a rebuilt plan's points: closer points give no direction
 ROUTE = (
     *("waypoint_near_x_m", "waypoint_near_y_m", "waypoint_far_x_m", "waypoint_far_y_m"),
     "route_remaining_m",
@@ -305,7 +305,7 @@ def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
     if len(line) == 1:
         ahead_of = np.array([np.cos(yaw[0]), np.sin(yaw[0])])
         return np.stack([line[0], line[0] + ahead_of * max(rest, SPACING_M)])
-    if rest > 0:  # the plan's end was never seen: continue straight for its length
+    if rest > 0:  # the plan's end was never seen: continue straight for the rest
         way = line[-1] - line[-2]
         way = way / max(float(np.hypot(*way)), 1e-9)
         line = np.concatenate([line, (line[-1] + way * rest)[None]])

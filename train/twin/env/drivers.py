@@ -195,8 +195,8 @@ class Handover:
         self._since_handover[robots] = self._still[robots] = 0
 
 
-# Less room than TOUCH_M counts as a hit, and less than ROOMY_M costs. Both are for robots at least
-# WIDTH_M wide, and are scaled down for narrower ones.
+# Clearance below TOUCH_M counts as a hit; below ROOMY_M, it lowers an action's score. Both are for
+# robots at least WIDTH_M wide, and are scaled down for narrower ones.
 TOUCH_M, ROOMY_M, WIDTH_M = 0.05, 0.12, 0.5
 PERSON_MARGIN_M = 0.4  # distance to keep from people who move
 STANDING_MARGIN_M = 0.2  # distance to keep from people who stand

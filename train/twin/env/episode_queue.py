@@ -28,7 +28,7 @@ from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, refuse
 from restock.train.twin.physics.perturbation import Schedule
 
 TRIES = 300  # seeds that are tried for a route through a zone
-WAY_POINTS = 24  # points on each leg of a plan at which zones are looked up
+WAY_POINTS = 24  # number of points on each leg of a plan whose zones are looked up
 
 
 @dataclass(frozen=True)
