@@ -340,7 +340,7 @@ def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> 
             words = str(sql).upper().split()[:2]
             if kind != "table" or words != ["CREATE", "TABLE"]:
                 raise sqlite3.DatabaseError(f"{table} is not a plain table")
-        # The PRAGMA statement: its form `FROM pragma_table_xinfo(…)` fails with trusted_schema OFF.
+        # By the statement: a database can shadow the function `pragma_table_xinfo` with a table.
         if any(row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")):
             raise sqlite3.DatabaseError(f"{table} has computed columns")
 
