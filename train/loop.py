@@ -34,10 +34,10 @@ from restock.train.run.run import resume_command
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
-_CONSERVATIVE_STEPS = 20_000  # environment steps in which the CQL term's weight falls to 0
+_CONSERVATIVE_STEPS = 20_000  # online environment steps until the CQL term's weight is 0
 _OFFLINE_BLOCK = 64  # updates between two checks of the clock and of Ctrl-C
-# Shares of a budget in seconds after which cloning, and then the updates on the logs, must end: the
-# other half is for the twin.
+# Parts of a budget in seconds after which cloning and the updates on the logs must end. The second
+# half of the budget is for the twin.
 _CLONING_UNTIL, _LOGS_UNTIL = 0.25, 0.5
 Notify = Callable[[str, dict[str, Any]], None]  # name of an event, its values
 
@@ -77,8 +77,8 @@ def train(
 
     Raises:
         TrainingInterrupted: `stop` returned True.
-        TeacherFailed: the teacher raised an error or returned invalid actions. The step that it was
-            queried for was not made, and a checkpoint was written.
+        TeacherFailed: the teacher raised an error or returned invalid actions. The step for which
+            the teacher was queried was not made, and a checkpoint was written.
         NotFinite: a loss or gradient is NaN or infinite; names the rows of the batch.
     """
     if nothing_to_do(session) is not None:
@@ -117,15 +117,15 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         if session.interval.updates:
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
-            _evaluate_off_policy(session, notify, stop)  # on held-out logs, before it drives
+            _evaluate_off_policy(session, notify, stop)  # the policy has not driven yet
         _evaluate(session, notify, stop)
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
-    _evaluate_if_due(session, notify, stop)  # if the run was stopped during an evaluation
+    _evaluate_if_due(session, notify, stop)  # due here if the run was stopped during one
     while progress.env_steps < schedule.env_steps and time_left(session):
         _stop_if_requested(session, stop)
-        # 2. Warm-up: the policy from the logs drives; nothing is learnt from its rows yet.
+        # 2. Warm-up: the policy learnt from the logs drives, but no updates are made yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
         if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
             progress.online_from, progress.online_from_s = progress.env_steps, session.wall_s
@@ -160,7 +160,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
-        # … and at the end of a practice interval, the twin gets the shares of its next missions.
+        # … and if a practice interval is over, the twin gets new shares for its next missions.
         session.practice.note(ended)
         session.run.append("practice", session.practice.advance(session.steps))
 
@@ -233,7 +233,7 @@ def _run_updates(session: Session, count: int, phase: str, notify: Notify) -> No
         sync = target.last_sync
         for number, (batch, loss, tail) in enumerate(_make_updates(session, made, phase), start=1):
             _record_update(session, batch, loss, sync, tail, phase)
-            if number < made:  # `_advance_target` does it for the last update
+            if number < made:  # after the last update, `_advance_target` does this
                 target.after(session.learner.gradient_steps)
             sync = target.last_sync
         _advance_target(session, phase, notify)
@@ -241,7 +241,7 @@ def _run_updates(session: Session, count: int, phase: str, notify: Notify) -> No
 
 
 def _updates_to_make(session: Session, count: int) -> int:
-    """Return how many of `count` updates to make until an interval ends or the target is copied."""
+    """Return how many of `count` updates to make until the interval's end or the target's copy."""
     if session.blocks is None:
         count = 1 if session.batches.needs_td else min(count, LONGEST)
     step, rule = session.learner.gradient_steps, session.learner.target.rule
@@ -252,7 +252,7 @@ def _updates_to_make(session: Session, count: int) -> int:
 
 
 def _make_updates(session: Session, count: int, phase: str) -> Iterator[MadeUpdate]:
-    """Make `count` updates."""
+    """Make `count` updates, and yield each."""
     progress, learner = session.progress, session.learner
     conservative = _conservative_weight(session, phase)
     imitation = session.imitation if phase == "online" else None
@@ -267,7 +267,7 @@ def _make_updates(session: Session, count: int, phase: str) -> Iterator[MadeUpda
             count, draw, conservative=conservative, labelled=imitation is not None
         )
         return
-    # All are drawn first: an update displaces the data of draws from the CPU's caches.
+    # Draw all batches first: an update evicts the data that draws use from the CPU's caches.
     drawn, failed = draw_ahead(draw, count)
     labelled = [None if imitation is None else imitation.draw_online() for _ in drawn]
     for batch, labels in zip(drawn, labelled, strict=True):
@@ -310,7 +310,7 @@ def _advance_target(session: Session, phase: str, notify: Notify) -> None:
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
     if isinstance(rule, Hard) and learner.target.is_due(step) and last_of_interval:
-        # A hard sync makes the distance 0, so it is measured just before.
+        # A hard sync makes the distance to the target 0, so measure the distance just before it.
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:
             interval.lag_before_sync = session.probe.measure(learner)[1]
@@ -383,7 +383,7 @@ def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bo
     """Evaluate the policy on held-out logs, if there are any, and write the table `off_policy`."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
-    if session.run.table("off_policy").num_rows:  # evaluated before the run was stopped
+    if session.run.table("off_policy").num_rows:  # done before the run was stopped
         return
     config, learner = session.config, session.learner
     ope = OpeConfig(seed=config.seed)
@@ -451,10 +451,10 @@ def _save(session: Session) -> None:
 
 
 def time_left(session: Session, part: float = 1.0) -> bool:
-    """Return whether the first `part` of the budget in seconds has room for more than evaluating.
+    """Return whether the first `part` of the budget in seconds leaves time besides an evaluation.
 
     The budget covers all that a user waits for: cloning, updates on the logs, driving, evaluations.
-    The first interval of updates is always made, so that there is something to report.
+    It is not checked in the first interval of updates, so that there is something to report.
     """
     seconds = session.config.schedule.seconds
     if seconds is None or session.learner.gradient_steps < session.config.record.every_updates:
@@ -463,10 +463,10 @@ def time_left(session: Session, part: float = 1.0) -> bool:
 
 
 def nothing_to_do(session: Session) -> str | None:
-    """Return why a resumed run would end at once, and what to do; None if it has work left."""
+    """Return why a resumed run would end at once, and what to do; None if there is work left."""
     progress, schedule = session.progress, session.config.schedule
     if progress.evaluated_at != progress.env_steps or _interval_is_open(session):
-        return None  # its last evaluation or interval is missing
+        return None  # the last evaluation or the end of an interval is missing
     if not session.config.env.twin:
         return "it learns from logs alone, and has made its updates"
     if progress.env_steps >= schedule.env_steps:
@@ -497,10 +497,10 @@ def _stop_if_requested(session: Session, stop: Callable[[], bool]) -> None:
 
 
 def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, phase: str) -> None:
-    """Check the loss of the last update, whose batch `session.feed` holds.
+    """Check the loss of the last update, `value`; `session.feed` still has the batch's row ids.
 
     Raises:
-        NotFinite: the loss, `value`, is not finite; names the rows of the batch to blame.
+        NotFinite: the loss is not finite; names the rows of the batch that made it so.
     """
     if math.isfinite(value):
         return
@@ -519,7 +519,7 @@ def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, 
 
 
 def check_parameters(session: Session) -> None:
-    """Check the parameters before they are recorded, evaluated or kept.
+    """Check that the parameters are finite, before they are recorded, evaluated or kept.
 
     Raises:
         NotFinite: a parameter is not finite; names the rows of the last batch.

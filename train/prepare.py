@@ -96,7 +96,7 @@ class Prepared:
             teacher = open_teacher(
                 self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
             )
-        if teacher is not None and self.resumed is None:  # find errors before anything is written
+        if teacher is not None and self.resumed is None:  # fail before anything is written
             teacher.query(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
         lock = RunLock(self.path)
@@ -105,7 +105,7 @@ class Prepared:
             try:
                 session = self._build(run, env, teacher, layouts)
             except BaseException:
-                if self.resumed is None:  # remove the folder of a run that never began
+                if self.resumed is None:  # remove the folder, as the run never began
                     shutil.rmtree(self.path, ignore_errors=True)
                 raise
         except BaseException:
@@ -115,7 +115,7 @@ class Prepared:
         return session
 
     def _run(self) -> Run:
-        """Create the run's directory, or remove a stopped process's leftovers from the old one."""
+        """Create the run's directory; or clear a resumed one of a stopped process's leftovers."""
         if self.resumed is None:
             return Run.create(self.path, self.document)
         self.resumed.remove_leftovers()
@@ -165,8 +165,8 @@ def train(
         config: a config, the path of its TOML file, or None for the defaults.
         panel: the folder of a panel; None: online only.
         settings: overrides of the config, each as `key.path=value`.
-        teacher: queried in the twin instead of the one that `teacher.source` names: an object with
-            `act(env, observation)`, or such a function. It returns actions (N,).
+        teacher: queried in the twin instead of the teacher that `teacher.source` names: an object
+            with `act(env, observation)`, or a function like `act`, which returns actions (N,).
         stop: called between steps; True ends the run with a checkpoint.
         notify: called for every row of `progress` and every evaluation.
 
@@ -218,8 +218,8 @@ def prepare_new(
     expect_installed("record.trackers", *config.record.trackers)
     driven = {config.env.layouts, _evaluation_layouts(config)} if config.env.twin else ()
     for layouts in driven:
-        # Report errors before anything is written. Evaluation drives all kinds
-        # that are named, whatever their share.
+        # Evaluation drives every kind of mission that `env.conditions` names, even with share 0,
+        # so each must fit on the floors.
         refuse_unfit(open_floors(layouts), config.env.conditions)
     fed = Panel.open(panel_path) if panel_path is not None else None
     if fed is not None and (not chosen or carries_profile(fed, config.profile)):
@@ -237,7 +237,7 @@ def prepare_new(
     config = resolve_config(config, panel)
     check_new_run(config, profile.task, panel)
     requested = None
-    if config.teacher.source != GIVEN:  # created only once, as it may be large
+    if config.teacher.source != GIVEN:  # created here only, as it may be large
         requested = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
     return Prepared(out, config, profile, panel, written, requested=requested)
@@ -266,7 +266,7 @@ def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
         )
     if config.teacher.mirror:
         should_mirror(config.teacher, profile.task)  # raises if an action has no opposite
-    panel = run_panel(run.document)  # raises if it is gone or was replaced
+    panel = run_panel(run.document)  # raises if the panel is gone or was replaced
     if panel is not None:
         panel = open_panel(panel.path, config, profile)
     return Prepared(path, config, profile, panel, run.document, run)
@@ -290,7 +290,7 @@ def _never_driven(names: Sequence[str], config: TrainConfig) -> Bools:
 
 
 def refuse_short_budget(session: Session, seconds: float) -> None:
-    """Estimate how long an evaluation takes, and refuse a budget that two would use up.
+    """Estimate the time of an evaluation, and refuse a budget that two evaluations use up.
 
     Raises:
         ConfigError: the budget is too short; names one that suffices.
@@ -312,7 +312,7 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
     """Open a panel, check its bytes, and compare it with the twin's task and the config's discount.
 
     Raises:
-        PanelError: it is damaged, or its task or discount differs; names both values.
+        PanelError: the panel is damaged, or its task or discount differs; names both values.
     """
     panel = Panel.open(path, verify=True)
     if panel.task_hash != profile.task.hash:
@@ -366,8 +366,8 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
             "forecast": controller.forecast(),
             "planned_draws": asdict(planned),
         }
-    # Left out in runs of earlier Restocks, whose target had the target network's value, and for a
-    # user's own algorithm, which defines its own target.
+    # `next_value` is missing in runs of earlier Restocks, whose TD target used the target network's
+    # value, and in runs of a user's own algorithm, which defines its own TD target.
     lower = config.loss.algorithm == "dqn" and config.loss.double and not config.teacher.has_filter
     return {
         "created_ns": now_ns(),

@@ -28,13 +28,13 @@ from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturba
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """Fill in exploration, perturbation and missions, which the config may leave open."""
+    """Fill in the first epsilon, and the content of perturbation and missions files."""
     epsilon = config.epsilon
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
         epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
     env = config.env
-    if env.perturbation not in PERTURBATIONS:  # a file may change later: the run keeps its content
+    if env.perturbation not in PERTURBATIONS:  # keep a file's content, as it may change later
         perturbation = find_perturbation(env.perturbation, where="env.perturbation")
         env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
     if isinstance(env.missions, str):
@@ -46,7 +46,7 @@ ASSUMED_STEPS_PER_S = 800.0  # environment steps per second, assumed until the s
 
 
 def planned_env_steps(config: TrainConfig) -> int:
-    """Return the environment steps that a budget allows, before this machine's speed is known."""
+    """Return how many environment steps a budget allows; one in seconds, at the assumed speed."""
     schedule = config.schedule
     if schedule.seconds is None:
         return schedule.env_steps
@@ -54,7 +54,7 @@ def planned_env_steps(config: TrainConfig) -> int:
 
 
 def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedDraws:
-    """Count the rows that a run will draw in `env_steps` (None: `planned_env_steps`)."""
+    """Count the rows that a run draws in `env_steps`; None: in `planned_env_steps`."""
     schedule, batch_size = config.schedule, config.replay.batch_size
     end = planned_env_steps(config) if env_steps is None else env_steps
     begin = min(schedule.warmup_env_steps, end)
@@ -66,8 +66,8 @@ def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedD
     )
 
 
-_ROWS_OF_UPDATES = 5_000  # cloned rows for as many updates as the critic's; more rows take more
-_MAX_UPDATES = 10.0  # limit of the behaviour network's updates, in multiples of the critic's
+_ROWS_OF_UPDATES = 5_000  # cloned rows up to which cloning makes as many updates as the critic
+_MAX_UPDATES = 10.0  # most updates of the behaviour network, in multiples of the critic's
 
 
 def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) -> TrainConfig:
@@ -111,7 +111,7 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
             where="teacher.successes",
             remedy="leave it out, or add drivers to teacher.policies",
         )
-    # Cloned successes slow learning down if a teacher answers in the twin: docs/train.md.
+    # Cloned successes slow learning down if a teacher is queried in the twin (docs/train.md).
     return logged and not teacher.queried if teacher.successes is None else teacher.successes
 
 
@@ -119,7 +119,7 @@ def should_mirror(teacher: TeacherConfig, task: Task) -> bool:
     """Decide whether the behaviour network learns from mirror images.
 
     Raises:
-        ConfigError: the config asks for them, but an action has no opposite.
+        ConfigError: `teacher.mirror` is true, but an action has no opposite.
     """
     try:
         Mirror.of(task)
@@ -135,7 +135,7 @@ def should_mirror(teacher: TeacherConfig, task: Task) -> bool:
     return teacher.mirror is True or teacher.source == "operator"
 
 
-_SLOT_BYTES = 18  # for a row's stratum, its position there, and its age
+_SLOT_BYTES = 18  # bytes of a slot's stratum, position in the stratum, and age
 
 
 def row_bytes(observation_size: int) -> int:
@@ -148,7 +148,7 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
     """Refuse settings that would fail, or have no effect, once the run has begun.
 
     Raises:
-        ConfigError: see the top of this file; names the setting.
+        ConfigError: the module's docstring lists when; names the setting.
     """
     _refuse_no_effect(config)
     check_terms(config, panel)

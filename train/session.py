@@ -50,14 +50,14 @@ class Progress:
     env_steps: int = 0
     online_from: int | None = None  # environment steps when online updates began
     online_updates: int = 0
-    evaluated_at: int = -1  # environment steps of the last evaluation
+    evaluated_at: int = -1  # environment steps at the last evaluation
     checkpointed_at: int = 0
     wall_s: float = 0.0  # training time up to the last checkpoint
     driving_from_s: float | None = None  # training time when driving in the twin began
     online_from_s: float | None = None  # training time when online updates began
     offline_update_s: float = 0.0  # mean time of an update on the logs
     evaluation_s: float = 0.0  # time of the last evaluation; before the first, an estimate
-    planned_env_steps: int = 0  # steps that the shares of batches are planned for
+    planned_env_steps: int = 0  # environment steps that the shares of batches are planned for
 
 
 @dataclass
@@ -110,7 +110,7 @@ class Session(Stateful):
     ring: FreshRing
     batches: Batches
     collector: Collector
-    fixed_episodes: Sequence[EpisodeSpec]  # driven by every evaluation: all kinds of the config
+    fixed_episodes: Sequence[EpisodeSpec]  # driven by every evaluation: of all kinds in the config
     feed: FeedRecord
     events: Events
     probe: Probe | None
@@ -142,7 +142,7 @@ class Session(Stateful):
         }
 
     def plan(self) -> None:
-        """Plan the shares of batches for the environment steps that the budget still allows.
+        """Plan the shares of batches for the number of environment steps that the budget allows.
 
         A budget in seconds is converted to steps by the speed so far. After online updates have
         begun, call this only just before a checkpoint, so that a resumed run has the same plan.
@@ -166,7 +166,7 @@ class Session(Stateful):
         made = progress.env_steps - (progress.online_from or 0)
         if made >= self.config.record.every_updates:
             return made / max(wall_s - progress.online_from_s, 1e-9)
-        # Online updates have just begun: add the measured times of a driving step and its updates.
+        # Too few online steps to measure: add the measured times of a driving step and its updates.
         step_s = (wall_s - progress.driving_from_s) / max(progress.env_steps, 1)
         update_s = self.config.schedule.updates_per_env_step * progress.offline_update_s
         return 1.0 / max(step_s + update_s, 1e-9)
@@ -184,7 +184,7 @@ class Session(Stateful):
     def write_held(self) -> None:
         """Also write the rows whose episodes have not ended, so that the tables are complete.
 
-        Call it after `save`: a resumed run removes these rows, and has them from its checkpoint.
+        Call this after `save`. A resumed run drops these rows and takes them from its checkpoint.
         """
         self.feed.write_held()
         self.run.flush()
@@ -217,7 +217,7 @@ class Session(Stateful):
         self.load_state_dict(state)
         schedule = state["config"].get("schedule") if state.get("config") else None
         if schedule is not None and schedule != msgspec.to_builtins(self.config.schedule):
-            self.plan()  # the budget was extended
+            self.plan()  # the budget was changed
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
 

@@ -58,10 +58,10 @@ class FeedOptions:
     """Keyword options of the buffer."""
 
     run: str | Path | None = None  # the run directory to make; None: no record is kept
-    logs_share: float | None = None  # share of a batch; None: as the panel's mixture
+    logs_share: float | None = None  # logged rows' share of a batch; None: the mixture's
     # Profile of the environment; None: that of the panel, or warehouse_amr without a panel.
     profile: str | None = None
-    seed: int = 0  # of the draws, and of the choice of batches to audit
+    seed: int = 0  # seed of the draws, and of the choice of batches to audit
     audit_share: float = 0.01  # share of batches whose rows are all recorded
     log_every: int = 500  # batches per logging interval
     # Other settings to record in the run, by the keys of `restock train`: target, loss, …
@@ -72,8 +72,8 @@ class MixedFeed:
     """A source of batches: rows of a panel and of a ring of fresh rows, by the panel's mixture.
 
     Args:
-        capacity, num_envs, observation_size, n_step: of the ring, `ring`.
-        discount: of the ring's rows; None: the panel's, or .99 without a panel.
+        capacity, num_envs, observation_size, n_step: the arguments of the `FreshRing`, `ring`.
+        discount: discount of the ring's rows; None: the panel's, or .99 without a panel.
         panel: None for fresh rows alone.
 
     A panel made from a table of any task has no profile. The environment then names the condition
@@ -111,7 +111,7 @@ class MixedFeed:
         self._sampler: LoggedSampler | None = None
         self._td_missing = False  # whether the last batch came without TD errors
         self._phase = "offline"
-        self._open = 0  # batches since the last rows were written
+        self._open = 0  # batches in the open logging interval
         self._episodes: dict[int, dict[str, Any]] = {}
         self._begun = time.monotonic()
         if discount is None:
@@ -164,7 +164,7 @@ class MixedFeed:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
 
     def draw_logs(self, batch_size: int) -> BatchDraw:
-        """Draw the logged rows (L,) of a batch, by the mixture; all of it while the ring is empty.
+        """Draw a batch's logged rows (L,) by the mixture; while the ring is empty, all its rows.
 
         Raises:
             MixtureError: the ring is empty and the panel's rows have reached their limit of draws;
@@ -196,10 +196,10 @@ class MixedFeed:
         return drawing
 
     def draw_fresh(self, count: int) -> Ints:
-        """Draw `count` slots of the ring uniformly, of rows within the mixture's limit of age.
+        """Draw `count` slots of the ring uniformly, from rows below the mixture's limit of age.
 
         Raises:
-            MixtureError: there is no such row.
+            MixtureError: the ring has no row, or only rows above that age.
         """
         if not count:
             return _NO_ROWS
@@ -223,10 +223,10 @@ class MixedFeed:
         td: F32 | None = None,
         q: F32 | None = None,
     ) -> None:
-        """Record the batch of one update, packed rows (B, W) with those from logs first.
+        """Record the batch of one update: packed rows (B, W), logged rows first.
 
-        `td` (Q - target) and `q`, (B,), are null in the tables if they are None. Priorities are
-        updated by `td` if it is given.
+        `td` (B,), Q minus target, and `q` (B,) are null in the tables if they are None. If `td` is
+        given, it also updates the priorities.
 
         Raises:
             NotFinite: a row or a TD error is NaN or infinite; names the rows.
@@ -236,7 +236,7 @@ class MixedFeed:
         try:
             check_fed(packed, td, lambda: self._row_ids(drawing, slots), run=path, steps=steps)
         except NotFinite:
-            self.flush()  # the tables are complete up to here
+            self.flush()  # so that the tables have all batches up to this one
             raise
         if self._sampler is not None and self._sampler.needs_td and len(drawing.rows):
             self._td_missing = td is None
@@ -290,7 +290,7 @@ class MixedFeed:
         return row_ids(self.logs, drawing.rows, meta["episode"][slots], meta["episode_step"][slots])
 
     def flush(self) -> None:
-        """Write all rows to the run's files, those of running episodes without their conditions."""
+        """Write all rows to the run's files; rows of running episodes get no conditions."""
         self._close_interval()
         if self.record is not None and self.run is not None:
             self.record.write_held()
@@ -324,7 +324,7 @@ class MixedFeed:
             self.episode_labels.give_up(key)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Save how long it ran in place of its start: another process has another clock."""
+        """Save the time run so far, not the time of the start: clocks differ between processes."""
         return vars(self) | {"_begun": time.monotonic() - self._begun}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -333,9 +333,9 @@ class MixedFeed:
 
 
 def environment_profile(name: str | None, panel: Panel | None) -> Profile | None:
-    """Return the profile `name`; without a name the panel's, without a panel warehouse_amr.
+    """Return the profile `name`; if that is None, the panel's, or without one warehouse_amr.
 
-    None if the panel was made from a table of any task, which has no profile.
+    Return None if the panel was made from a table of any task, which has no profile.
     """
     if name is None and panel is not None:
         return None if panel.task_hash.startswith("table-") else profile_of_panel(panel)
@@ -343,7 +343,7 @@ def environment_profile(name: str | None, panel: Panel | None) -> Profile | None
 
 
 def make_labeller(profile: Profile | None, panel: Panel | None, num_envs: int) -> FreshLabels:
-    """Make the labeller of fresh episodes: by the profile's conditions, or by infos without one."""
+    """Make a labeller that uses the profile's conditions, or without a profile those in infos."""
     if profile is None:
         names = panel.header.conditions if panel is not None else [NOMINAL]
         return FreshLabels(None, num_envs, names)
@@ -372,7 +372,7 @@ def _check_panel(panel: Panel, profile: Profile | None, observation_size: int) -
         )
 
 
-# Columns of `episodes` that the info of an episode's last step has under the same name.
+# Columns of `episodes` that are copied from the info of an episode's last step.
 _INFO_COLUMNS = ("episode_seed", "perturbation", "block", "success", "bumps")
 
 
@@ -394,7 +394,7 @@ def _create_run(
         about = profile_document(profile) | {
             "not_evaluated": conditions_in_twin(profile.conditions, signals, lidar=lidar)[1]
         }
-    else:  # a table of any task
+    else:  # the panel was made from a table of any task
         task_hash = None if panel is None else panel.task_hash
         about = {"task_hash": task_hash, "actions": [], "labels_version": None}
     return Run.create(
@@ -461,7 +461,7 @@ def _plain_value(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
-EPISODES_PER_QUERY = 8  # at most; fewer if there are fewer environments
+EPISODES_PER_QUERY = 8  # ended episodes labelled at once, or num_envs if that is less
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
 _SIGNAL_NAMES = tuple(signal.name for signal in STORED_SIGNALS)
 
@@ -471,12 +471,12 @@ class Labelled:
     """The labels of an episode."""
 
     key: int
-    codes: Ints  # (T,) of each step's condition; the last code is nominal
+    codes: Ints  # (T,) code of each step's condition; the last code is nominal
     conditions: list[str]  # conditions that held at some step
 
 
 class FreshLabels:
-    """The labeller of N environments' episodes, by the infos of their steps.
+    """A labeller that finds the conditions of N environments' episodes from their steps' infos.
 
     Args:
         conditions: evaluated on the infos' signals; None: each info names its step's `condition`.
@@ -496,7 +496,7 @@ class FreshLabels:
             self.names = (*(condition.name for condition in self.conditions), NOMINAL)
             self._enough = min(EPISODES_PER_QUERY, num_envs)
         self._running: list[list[Any]] = [[] for _ in range(num_envs)]
-        self._ended: list[tuple[int, list[Any]]] = []  # key, and the signals or name of each step
+        self._ended: list[tuple[int, list[Any]]] = []  # key; signals or condition per step
 
     def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
         """Add one environment's step; `key` names its episode.
@@ -516,7 +516,7 @@ class FreshLabels:
         return True
 
     def _step_facts(self, info: Mapping[str, Any]) -> Any:
-        """Return the signals of a step with its command, or its condition; None if unknown."""
+        """Return a step's signals and command, or the condition that it names; None if unknown."""
         if self.conditions is None:
             name = info.get("condition")
             return name if name in self.names else None
@@ -568,7 +568,7 @@ class FreshLabels:
             codes = np.zeros(len(rows), np.int64)
         labelled, begin = [], 0
         for (key, _), length in zip(waiting, lengths, strict=True):
-            inside = slice(begin, begin + length - 1)  # no transition begins at the last step
+            inside = slice(begin, begin + length - 1)  # the last step begins no transition
             begin += length
             names = [name for name, steps in held.items() if steps[inside].any()]
             labelled.append(Labelled(key, codes[inside], names))

@@ -48,16 +48,16 @@ class MixtureReplayBuffer(ReplayBuffer):
 
     `replay_buffer_kwargs` may hold:
 
-    - `panel`: a panel or its directory; without one all rows are fresh.
+    - `panel`: a panel or its directory; without a panel, all rows are fresh.
     - `n_step`, `discount`: of fresh rows; default 1, and the panel's discount or .99.
-    - `ignore_weights`: True accepts a panel with importance weights, and does not use them:
-      Stable-Baselines3's losses cannot. Without it, such a panel is refused.
-    - `commands`: (n, 2), the command of every row of the panel, for a continuous action space; see
-      `logged_commands`. Default: the task's action that was nearest to it.
+    - `ignore_weights`: True accepts a panel with importance weights but ignores the weights, which
+      Stable-Baselines3's losses cannot use. By default, such a panel is refused.
+    - `commands`: (n, 2), the logged command of every row of the panel, for a continuous action
+      space; see `logged_commands`. Default: the command of the task's action in the row.
     - `run`, `logs_share`, `profile`, `seed`, `audit_share`, `log_every`: see `FeedOptions`.
 
-    `critic`, if set, computes (Q, TD) of every batch, (B,) each, which are then recorded by
-    condition; `dqn_critic(model)` makes one. It costs its forward passes.
+    The attribute `critic`, if set, computes (Q, TD) of every batch, (B,) each, for the record.
+    `dqn_critic(model)` makes a critic. It costs additional forward passes.
 
     Raises:
         MixtureError: `optimize_memory_usage` is True; at first use, the panel has weights, or
@@ -85,7 +85,7 @@ class MixtureReplayBuffer(ReplayBuffer):
     ) -> None:
         if optimize_memory_usage:
             raise MixtureError("optimize_memory_usage is unsupported with a mixture")
-        # The ring has the rows, packed like the panel's; the parent gets almost no memory.
+        # The parent's arrays are kept tiny: the ring holds the rows, packed like the panel's.
         super().__init__(n_envs, observation_space, action_space, device, n_envs=n_envs)
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size, n_envs * n_step)
@@ -95,7 +95,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self._options = FeedOptions(**options)
         self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
         self._waiting_actions: dict[tuple[int, int], F32] = {}
-        self._steps = np.zeros(n_envs, np.int64)  # so far in the running episodes
+        self._steps = np.zeros(n_envs, np.int64)  # steps so far in each running episode
         self._log_actions: F32 | None = None
         self.critic: Critic | None = None
 
@@ -148,7 +148,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         return np.clip(scaled, -1, 1).astype(np.float32)
 
     def reset(self) -> None:
-        """Empty the buffer; Stable-Baselines3 calls this only when it makes one."""
+        """Reset the parent's position; Stable-Baselines3 calls this only to create the buffer."""
         self.pos, self.full = 0, False
 
     def add(
@@ -160,14 +160,14 @@ class MixtureReplayBuffer(ReplayBuffer):
         done: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        """Add one step of every environment; `next_obs` is the last one if an episode ended."""
+        """Add one step of every environment; if an episode ended, `next_obs` is its last one."""
         ring = self.ring
         done = np.asarray(done, np.bool_)
         cut = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos]) & done
         cut &= self.handle_timeout_termination
         chosen = action.reshape(self.n_envs, self.action_dim)
         index = chosen[:, 0]
-        if self.continuous:  # the record has the task's action that was nearest
+        if self.continuous:  # the packed row has the task's nearest action
             index = np.array([info.get("action", 0) for info in infos])
         before = ring.appended
         keys = ring.append(
@@ -183,7 +183,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         )
         for key, step, taken in zip(keys.tolist(), self._steps.tolist(), chosen, strict=True):
             self._waiting_actions[key, step] = np.array(taken, np.float32)
-        # The ring adds an n-step row steps later: find its action by its episode and step.
+        # The ring adds an n-step row up to n steps later: look its action up by episode and step.
         for slot in (np.arange(before, ring.appended) % ring.capacity).tolist():
             place = int(ring.meta["episode"][slot]), int(ring.meta["episode_step"][slot])
             self._fresh_actions[slot] = self._waiting_actions.pop(place)
@@ -242,16 +242,16 @@ class MixtureReplayBuffer(ReplayBuffer):
         )
 
     def close(self) -> None:
-        """Write the rest of the record; the run is complete after it."""
-        if "feed" in vars(self):  # a model that was only loaded has made no run
+        """Write the rest of the record, which completes the run."""
+        if "feed" in vars(self):  # else the buffer was never used, and has made no run
             self.feed.flush()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the critic: it refers to the model, which is saved by itself."""
+        """Leave out the critic: it refers to the model, which Stable-Baselines3 saves itself."""
         return vars(self) | {"critic": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the buffer, and begin new episodes, as the environments of a loaded model do."""
+        """Restore the buffer, and begin new episodes, as a loaded model resets its environments."""
         vars(self).update(state)
         if "feed" in vars(self):
             self.feed.begin_episodes()
