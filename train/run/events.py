@@ -25,7 +25,7 @@ from restock.toml import by_path
 from restock.train.run.run import Run
 
 TRACKING = "tracking.json"
-GIVE_UP_AFTER = 3  # failures in a row: an unreachable server would cost its timeout every time
+GIVE_UP_AFTER = 3  # failed calls in a row that disable a sink: each may wait for a server's timeout
 
 
 class Sink(Protocol):
@@ -174,10 +174,10 @@ def _to_stderr(text: str) -> None:
     sys.stderr.write(f"{text}\n")
 
 
-PROJECT = "restock"  # unless WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME names another
+PROJECT = "restock"  # project's name, unless WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME is set
 _PANEL = ("id", "path", "store", "store_version", "others")
-_MAX_PARAMS = 100  # per call of MLflow
-_MAX_VALUE = 500  # characters that every MLflow store accepts
+_MAX_PARAMS = 100  # parameters per call of MLflow
+_MAX_VALUE = 500  # longest value of a parameter, in characters, that every MLflow store accepts
 
 
 def tracker_sinks(
@@ -223,7 +223,7 @@ class WandbSink:
         self._run.log(dict(values), step=step)
 
     def flush(self) -> None:
-        """Do nothing: W&B's own process writes as it goes."""
+        """Do nothing: W&B's own process writes all the time."""
 
     def close(self) -> None:
         self._run.finish()

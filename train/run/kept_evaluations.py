@@ -33,7 +33,7 @@ from restock.stats import (
 from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
-FILE = Path("eval") / "episodes.parquet"  # in a run
+FILE = Path("eval") / "episodes.parquet"  # in a run's directory
 LIMITED = "limited:"  # prefix of a policy whose commands pass the limiter
 _KEY_COLUMNS = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
@@ -131,7 +131,7 @@ def trained_step(shown: pa.Table) -> int | None:
 
 
 def _floor_names(layouts: str) -> str:
-    """Shorten a list of floors: file names without folders; of more than 3 the first and last."""
+    """Shorten a list of floors: drop folders, and of more than 3 all but the first and the last."""
     names = [part.rpartition("/")[2].strip() for part in layouts.split(",")]
     shown = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
     return ", ".join(shown)
@@ -147,12 +147,12 @@ def _episode_keys(table: pa.Table) -> list[tuple[str, ...]]:
     return list(zip(*columns, map(str, table["episode_seed"].to_pylist()), strict=True))
 
 
-CLONES = Path("eval") / "clones.parquet"  # in a run
+CLONES = Path("eval") / "clones.parquet"  # in a run's directory
 
 
 @dataclass(frozen=True)
 class CloneQuality:
-    """The quality of a clone, a row of `RUN/eval/clones.parquet`: see the columns' meanings."""
+    """The quality of a clone, a row of `RUN/eval/clones.parquet`: `EVAL_CLONES` explains it."""
 
     policy: str
     drivers: list[str]
@@ -170,7 +170,7 @@ class CloneQuality:
 
     @property
     def poor(self) -> str | None:
-        """Return why the clone may not stand in for the drivers; None if nothing shows that."""
+        """Return why the clone should not stand in for its drivers; None if no measure shows it."""
         if self.log_likelihood is None or self.agreement is None:
             return "the quality of the clone is not known: no row of its drivers is held out"
         if self.log_likelihood <= (self.frequencies_log_likelihood or 0.0):
@@ -243,8 +243,8 @@ def summary_rows(episodes: Iterable[Row]) -> list[dict[str, Any]]:
 def measures(episodes: Sequence[Row]) -> dict[str, Any]:
     """Compute the measures of one cell's episodes; None if no episode has the value.
 
-    Success is unknown if the task has no goal, the closest approach if nobody was about, and time
-    lost if the planner did not arrive or was not driven. Files of an earlier Restock lack others.
+    Success is None if the task has no goal, the closest approach if nobody was near, and time lost
+    if the planner did not drive to the goal. Files of an earlier Restock lack further values.
     """
 
     def known(name: str) -> list[float]:
@@ -308,9 +308,9 @@ def _limited_shares(episodes: Sequence[Row]) -> dict[str, float | None]:
 
 
 def _bumps_per_km(episodes: Sequence[Row]) -> ConfidenceInterval:
-    """Return all bumps over all kilometres, so that an episode counts by its distance.
+    """Return all bumps over all kilometres: each episode counts in proportion to its distance.
 
-    Without any bump, resamples do not vary: the upper end is then that of a Poisson rate.
+    If there is no bump, resamples do not vary, so the upper end is that of a Poisson rate.
     """
     reported = [row for row in episodes if row["distance_m"] is not None]
     km = np.array([row["distance_m"] / 1000 for row in reported])

@@ -17,20 +17,20 @@ from restock.train.run.run import Run
 
 
 class ReplayAuditRecord(msgspec.Struct, frozen=True):
-    """One sampled transition, of a seeded sample of batches.
+    """One transition of an audited batch; a seeded sample of batches is audited.
 
     It was collected before the last target sync if `gradient_step - age_steps < target_sync_step`.
     """
 
-    transition_id: int  # of a logged row as in the store; of a fresh row negative
+    transition_id: int  # for a logged row, its id in the store; for a fresh row, negative
     age_steps: int  # updates since it was collected; for a logged row, since the run began
-    age_days: float | None  # of a logged row: days before training began
+    age_days: float | None  # days from logging to the start of training; None: a fresh row
     condition: str | None  # None: a fresh row whose episode had not ended when the run did
-    behavior_policy: str  # behaviour policy
-    action: str  # its name
+    behavior_policy: str  # name of the policy that took the action
+    action: str  # the action's name
     reward: float  # the n-step return
     target_sync_step: int | None  # update after which the target last moved; None: not known
-    gradient_step: int  # update whose batch it was in
+    gradient_step: int  # number of the update whose batch contained the transition
 
 
 class ReplayAudit(Sequence[ReplayAuditRecord]):
@@ -78,14 +78,14 @@ def replay_audit(run: Path | str) -> ReplayAudit:
 
 
 SHORT = 0.02  # share of the rows fed; a smaller shortfall is not mentioned
-LOW_PART = 0.5  # part of a quota; a run that fed less warns
+LOW_PART = 0.5  # a warning is given if less than this part of a quota was fed
 
 
 def fed_shares(run: Run) -> list[dict[str, Any]]:
     """Return a row per stratum: its natural, wanted, drawn and short share of all rows fed.
 
-    `logs_share` and `fresh_share` are the sources of the drawn rows, `reason` is why it was short.
-    Empty for a run without a panel.
+    `logs_share` and `fresh_share` add up to the drawn share; `reason` is why the stratum was short.
+    The list is empty for a run without a panel.
     """
     sql = (files("restock.train.run") / "fed_shares.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:

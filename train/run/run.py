@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
 FORMAT = "restock-run/3"
-MEAN_OF = "mean_of"  # key of config.json: policies whose mean this untrained run is
+MEAN_OF = "mean_of"  # key of config.json: policies of other runs, whose mean is this run's policy
 _EARLIER = ("restock-run/1", "restock-run/2")
-_LONG_TABLE = 4096  # rows
-_UNKNOWN = -1  # number of rows on disk, if they differ from memory: the next flush writes them
+_LONG_TABLE = 4096  # rows from which `flush` does not always write a table
+_UNKNOWN = -1  # in place of the rows on disk if the file differs from memory: a flush rewrites it
 _REMEDY = "restore the file from a copy, or train the run again"
 Rows = Sequence[Mapping[str, Any]]
 
@@ -122,7 +122,7 @@ class Run:
         return f"<Run {self.path}>"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled run; the next flush replaces all tables, which may have later rows."""
+        """Restore a pickled run; the next flush rewrites all files, which may have later rows."""
         vars(self).update(state)
         self._on_disk = dict.fromkeys(TABLES, _UNKNOWN)
 
@@ -292,7 +292,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
 
 
 def now_ns() -> int:
-    """Return the wall time, ns; that of a run's start is the reference for ages of logged rows."""
+    """Return the wall time in ns; ages of logged rows refer to this time at the run's start."""
     return time.time_ns()
 
 
@@ -339,13 +339,13 @@ class RunLock:
                 holder = os.read(file, 256).decode("utf-8", "replace")
                 os.close(file)
                 raise _lock_error(run, holder) from error
-            except OSError:  # a file system without locks
+            except OSError:  # the file system has no locks: go on without one
                 os.close(file)
                 self._path.unlink(missing_ok=True)
                 return
             if _is_same_file(file, self._path):
                 self._file = file
-            else:  # the last holder has removed the file since it was opened here
+            else:  # the last holder removed the file after it was opened here: try again
                 os.close(file)
         os.ftruncate(self._file, 0)
         os.write(self._file, f"{os.getpid()} {platform.node()}".encode())
@@ -386,7 +386,7 @@ class PolicyOrigin:
     chosen: Literal["best", "latest", "mean"]
     env_steps: int  # for a mean of runs, the sum over the runs
     gradient_steps: int
-    run_env_steps: int  # of the run so far; 0: it never drove
+    run_env_steps: int  # environment steps of the run so far; 0: the run never drove
 
     @property
     def text(self) -> str:
@@ -426,7 +426,7 @@ def chosen_policy(run: Run) -> Literal["best", "latest", "mean"]:
 
 
 def latest_drives(run: Run) -> bool:
-    """Return whether the run learned something that it never evaluated in the twin."""
+    """Return whether the latest policy drives: what the run learned was never evaluated."""
     latest, best = _read_state(run.latest), _read_state(run.best)
     if not latest:
         return False

@@ -37,8 +37,8 @@ def profile_of_run(run: Run) -> Profile:
     """Return the profile that a run was trained with, from the text that the run contains.
 
     Raises:
-        RunError: that text cannot be read, or the run has no profile at all.
-        ConfigError: an older Restock wrote the run, without the text, and there is no such profile.
+        RunError: the text cannot be read, or the run has no profile at all.
+        ConfigError: an older Restock wrote the run without the text, and the profile is not found.
     """
     text, config = run.document.get("profile_toml", ""), run.document["config"]
     if not text and "profile" not in config:
@@ -57,13 +57,13 @@ def profile_of_run(run: Run) -> Profile:
 
 
 def carries_profile(panel: Panel, name: str) -> bool:
-    """Return whether `name` means the profile that the panel contains, and no other."""
+    """Return whether `name` is the profile that the panel contains, not a shipped one or a file."""
     own = panel.header.profile_toml and name == panel.header.profile
     return bool(own) and name not in shipped_profiles() and not Path(name).is_file()
 
 
 def profile_of_panel(panel: Panel) -> Profile:
-    """Return the profile of a panel's task, for users who name no other.
+    """Return the profile of a panel's task, for use if the user names no profile.
 
     Raises:
         PanelError: the panel contains no usable profile, and no shipped profile has its task.
@@ -79,10 +79,10 @@ def carried_profile(
 ) -> Profile:
     """Return the profile of a task: from the `text` kept with its rows, else a shipped one.
 
-    `option` is the command-line option for another profile, for the error's remedy.
+    `option` is the command-line option that gives another profile; the error's remedy names it.
 
     Raises:
-        error: neither has this task.
+        error: neither the text nor a shipped profile has this task.
     """
     problem, remedy = (
         "",
@@ -113,10 +113,10 @@ def carried_profile(
 
 
 def run_panel(document: Mapping[str, Any]) -> Panel | None:
-    """Open the panel that a run learnt from, by its `config.json`; None if it had none.
+    """Open the panel that a run learnt from, by its `config.json`; None if there was none.
 
     Raises:
-        PanelError: it is gone or cannot be read, or another panel is in its place.
+        PanelError: the panel is gone or cannot be read, or another panel is in its place.
     """
     fed = document.get("panel")
     if fed is None:
