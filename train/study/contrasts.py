@@ -25,7 +25,7 @@ from restock.train.evaluation.paired import agent_episodes
 from restock.train.run.run import Run
 from restock.train.twin.missions import MISSIONS
 
-# WHAT of a measure -> the (condition, block) pairs whose mean success it is; block None: none.
+# WHAT of a measure -> the cells (condition, block) whose success it averages; None: no block.
 CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {
     **{
         name: tuple((name, block) for block in mission.blocks or (None,))
@@ -64,11 +64,11 @@ class Contrast:
     arm_mean: float
     baseline_mean: float
     difference: float
-    low: float | None  # end of its 95 % interval, Student's t; None: see `no_interval`
+    low: float | None  # lower end of the difference's 95 % t interval; None: see `no_interval`
     high: float | None
-    sd: float | None  # of the paired differences
-    p: float | None  # under the hypothesis of no difference
-    p_holm: float | None = None  # adjusted for all contrasts except the primary one
+    sd: float | None  # standard deviation of the paired differences
+    p: float | None  # p value of the hypothesis that there is no difference
+    p_holm: float | None = None  # p adjusted by Holm for all contrasts but the primary; it has none
     no_interval: str | None = None  # why there is neither an interval nor a p value
 
     def as_json(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class RunCurve:
         return found
 
     def value(self, measure: str, reach: tuple[float, float] | None = None) -> float:
-        """Return the run's value of a measure, an `auc` over the steps `reach`; NaN if unknown."""
+        """Return the run's value of a measure, NaN if unknown; `reach` is the range of an `auc`."""
         kind, _, what = measure.partition("_")
         if kind == "success":
             return self._cells_mean(self.end, what)
@@ -120,8 +120,8 @@ class RunCurve:
                 success.get((condition, block or "none"), float("nan"))
                 for condition, block in CELLS[what]
             ]
-        # A study may leave out kinds, and all of a few aisles may be blocked alike: the mean is
-        # then over the cells that were driven.
+        # The mean is over the cells that were driven: a study may leave out kinds of missions, and
+        # if it has few blocked aisles, all of them may be blocked partly, or all wholly.
         known = [value for value in own if not np.isnan(value)]
         return _mean(known) if known else float("nan")
 
@@ -169,7 +169,7 @@ def contrast(
         return None
     differences = values[:, 0] - values[:, 1]
     interval, p = paired_t(differences)
-    interval = interval.within(-1.0, 1.0)  # each measure is a share
+    interval = interval.within(-1.0, 1.0)  # of two shares
     return Contrast(
         arm,
         baseline,
@@ -261,7 +261,7 @@ def _last_progress(path: Path) -> dict[str, Any] | None:
 
 
 def _success_by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
-    """Return success by cell for each evaluation; of two at the same steps, the later one."""
+    """Return success by environment steps and cell; a later evaluation at the same steps counts."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
     for row in table.to_pylist():
         step, update = int(row["env_steps"]), int(row["gradient_steps"])

@@ -33,7 +33,7 @@ class ArmConfig(Checked, frozen=True):
 
     name: str
     mixture: str | None = None  # name of a shipped mixture, or a TOML file
-    panel: str | None = None  # an existing panel
+    panel: str | None = None  # path of an existing panel
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # keys of `restock train --set`
     treatment: Treatment | None = None  # None: the study's treatment
     baseline: str | None = None  # arm to compare with; None: the first
@@ -41,7 +41,7 @@ class ArmConfig(Checked, frozen=True):
     def check(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
             raise ValueError(f"name must be letters, digits, . _ or -, got {self.name!r}")
-        if not self.name[0].isalnum():  # "..", a hidden folder, an option
+        if not self.name[0].isalnum():  # not "..", a hidden folder or an option
             raise ValueError(f"name must begin with a letter or a digit, got {self.name!r}")
         if self.mixture is not None and self.panel is not None:
             raise ValueError("panel must not be given beside mixture: choose one")
@@ -51,9 +51,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class StudyEvaluation(Checked, frozen=True):
-    """The episodes that every run's policy drives at its end; planner and operator do so once."""
+    """The episodes that each run's policy drives after training, and planner and operator once."""
 
-    # Number per kind, or a table by kind; a kind that the table leaves out is not driven.
+    # Episodes per kind of mission, or a table by kind; kinds that it leaves out are not driven.
     episodes: Count | dict[str, Count] = 40
     perturbations: tuple[str, ...] = ("none",)
 
@@ -75,13 +75,13 @@ class StudyEvaluation(Checked, frozen=True):
 class Primary(Checked, frozen=True):
     """The one contrast that a study tests, chosen before its runs."""
 
-    arm: str  # it is compared with its baseline
+    arm: str  # name of the arm that is compared with its baseline
     measure: str
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One comparison of a study."""
+    """An arm and the baseline that a study compares it with."""
 
     arm: ArmConfig
     baseline: ArmConfig
@@ -95,7 +95,7 @@ class Study(Checked, frozen=True):
     doc: str = ""
     store: str | None = None  # store from which mixtures are made
     seeds: tuple[int, ...] = (0, 1, 2)
-    treatment: Treatment = "mixture"  # of arms that name none
+    treatment: Treatment = "mixture"  # treatment of arms that name none
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all arms
     evaluation: StudyEvaluation = StudyEvaluation()
     primary: Primary | None = None
@@ -269,7 +269,7 @@ class StudyPlan:
         return json.dumps(self._request(job), indent=1) + "\n"
 
     def _request(self, job: StudyJob) -> dict[str, Any]:
-        """Return what a job requests, with its panel's relative path: a study may be moved."""
+        """Return what a job requests; the panel's path is relative, as a study may be moved."""
         own = None if job.arm.mixture is None else f"panels/{job.arm.name}"
         return {
             "settings": self.settings(job.arm, job.seed),

@@ -53,7 +53,7 @@ from restock.train.study.study import (
 )
 
 Say = Callable[[str], None]
-REFERENCES = ("planner", "operator")  # policies that drive the episodes of the runs once
+REFERENCES = ("planner", "operator")  # policies that drive the runs' episodes, once per study
 
 
 def run_study(
@@ -61,7 +61,7 @@ def run_study(
 ) -> list[Comparison | RunError]:
     """Run the open jobs, then compare every arm with its baseline, in the order of the arms.
 
-    In place of a comparison that cannot be made, the list has its error; the others are still made.
+    If a comparison cannot be made, the list has its error instead, and the others are still made.
 
     Raises:
         RestockError: a run failed; its log shows why.
@@ -139,7 +139,7 @@ def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
 
 
 def _mix_arguments(plan: StudyPlan, mixture: str) -> tuple[str, str]:
-    """Return the arguments of `restock mix` for a mixture: paths start at the study's folder."""
+    """Return store and mixture for `restock mix`, with paths taken from the study's folder."""
     store = str(plan.study.store)
     if "://" not in store:
         store = str(plan.folder / store)
@@ -197,7 +197,7 @@ def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
 def _drive_references(plan: StudyPlan, say: Say) -> None:
     """Drive the episodes of the runs with the planner and the operator, once.
 
-    The first run keeps the results.
+    Their results are stored in the first run's directory.
     """
     evaluation, path = plan.study.evaluation, plan.jobs[0].path
     done, requested = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
@@ -235,7 +235,7 @@ def restock_verb(arguments: Sequence[str], log: Path) -> None:
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env={**os.environ, "NO_COLOR": "1"},
-            start_new_session=True,  # Ctrl-C reaches it only through us: twice would end it at once
+            start_new_session=True,  # so that Ctrl-C comes only from us: a second ends it at once
         )
         with ended_with_us(process):
             process.wait()
@@ -255,7 +255,7 @@ NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")  # measures that are never b
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
-    """Return the study and its results as JSON values, with the `comparisons` of `run_study`."""
+    """Return the study and its results as JSON values; `run_study` returned the `comparisons`."""
     compared = [
         _comparison_json(pair, comparison)
         for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
@@ -275,7 +275,7 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
 
 
 def _comparison_json(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
-    """Return a comparison as JSON values; in place of an error, one with the error as reason."""
+    """Return a comparison as JSON; an error becomes an inconclusive comparison with its reason."""
     names = {"arm": pair.arm.name, "baseline": pair.baseline.name}
     if isinstance(comparison, RunError):
         why = f"{comparison.where}: {comparison.what}" if comparison.where else comparison.what
@@ -318,7 +318,7 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
     """Return a row for each arm and reference: success by cell, and safety and return.
 
-    Only unperturbed missions count, for safety and return only rare ones. A value is
+    Only unperturbed missions count; for safety and return, only rare ones of these. A value is
     [mean, low, high] over the seeds; low and high are None if `paired_t` gives no interval.
     """
     planner_s, references = _references(plan)
@@ -345,7 +345,7 @@ class _Curves:
         self._read: dict[Path, RunCurve] = {}
 
     def pairs(self, arm: ArmConfig, baseline: ArmConfig) -> list[tuple[RunCurve, RunCurve]]:
-        """Return the pair of runs of each seed that both arms have finished."""
+        """Return the two arms' runs of each seed, for seeds that both arms have finished."""
         both = zip(self._plan.runs(arm), self._plan.runs(baseline), strict=True)
         return [
             (self._curve(first), self._curve(second))
