@@ -392,7 +392,7 @@ class TableCommits(StoreReader):
             raise
 
     def discard_uncommitted(self, name: str, files: Sequence[AddedFile]) -> None:
-        """Delete those of the files that are not in the table, if possible.
+        """Delete the files, except any that are in the table, if possible.
 
         Some may be in the table: an error or interrupt can come right after a successful commit.
         """

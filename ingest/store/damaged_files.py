@@ -160,7 +160,7 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
         for path in unread:
             known.pop(path, None)
         known |= {path: stamps[path] for path in unread if path in stamps and path not in damaged}
-        with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # if not read-only
+        with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # fails if read-only
             out.write(json.dumps(known).encode())
     return damaged
 
@@ -246,7 +246,7 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
     if any(is_damaged(place, one) for one in _in_table(name, paths)):
         return []
     there = [one for file in readable[TRANSITIONS] for one in file.ingests]
-    known = {one.recording_id for one in there}  # have rows, maybe of a newer ingest
+    known = {one.recording_id for one in there}  # these have rows, maybe of a newer ingest
     reported = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
     unlisted = {one.ingest_id for one in there} - reported
     found = []
@@ -286,7 +286,7 @@ def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredF
         made.append(merge(store.path, name, sources, kept, schema))
     replaced = store.replace_files(name, {path}, made, OPERATION) is not None
     if replaced and name == RECORDINGS and OWN_PATH.fullmatch(path):
-        store.path.delete([f"{name}/{path}"])  # or readers would find it by its path
+        store.path.delete([f"{name}/{path}"])  # readers would still find it by its path
     return replaced
 
 

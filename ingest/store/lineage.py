@@ -324,7 +324,7 @@ class StoreReader:
         return next(iter(rows.slice(row, 1).to_pylist(maps_as_pydicts="strict")), None)
 
     def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
-        """Return the columns in `schema` of the manifests of these ingests.
+        """Read the manifests of these ingests, with the columns of `schema`.
 
         An ingest whose manifest is no longer in the store is left out.
 

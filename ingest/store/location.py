@@ -252,7 +252,7 @@ class Location:
     def has_new_commits(self, name: str, table: DeltaTable) -> bool:
         """Return whether a table that was read has newer commits, or was replaced meanwhile."""
         version = table.version()
-        if self.folder is not None:  # to look for the next commit's file is 100 times faster
+        if self.folder is not None:  # looking for the next commit's file is 100 times faster
             current, following = (f"{name}/{LOG}/{one:020}.json" for one in (version, version + 1))
             return (self.folder / following).exists() or not (self.folder / current).exists()
         with self.translate_errors():

@@ -245,7 +245,7 @@ class Moments:
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:
-        """Return which rows (N,) of a correction's episode (or else of any) are in its interval."""
+        """Mark rows (N,) in a correction's episode and interval or, if none, in its interval."""
         inside = (self.logged_ns >= correction.first_ns) & (self.logged_ns <= correction.last_ns)
         same = inside & (self.episode_index == correction.episode_index)
         return np.asarray(same if same.any() else inside, np.bool_)
@@ -404,7 +404,7 @@ class LabelScore:
 
     @property
     def shortfall(self) -> str:
-        """Describe how far precision or recall are below GOOD, and the condition's rate; or ""."""
+        """Describe precision or recall below GOOD, and how often the condition is true, or ""."""
         short = [
             f"{name} {GOOD - value:.2f} short of {GOOD}"
             for name, value in (("precision", self.precision), ("recall", self.recall))

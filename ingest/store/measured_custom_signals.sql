@@ -1,4 +1,4 @@
--- One value per episode for each of a profile's own signals, like measured_signals.sql for the others.
+-- One value per episode for each of a profile's own signals; other signals are in measured_signals.sql.
 -- Planning takes as long as for measured_signals.sql, so summaries skip it if no profile has own signals.
 WITH own_signals AS (
     -- include: custom_signals.sql

@@ -21,7 +21,7 @@ WITH tasks AS (
         FROM recordings
     )
 ), cleared AS (
-    -- Windows keep all this in memory: only needed columns, and sectors as observed, in half the bytes.
+    -- Window functions keep all these columns in memory: only needed ones, with sectors in half the bytes.
     SELECT
         recording_id,
         episode_id,
@@ -62,7 +62,7 @@ WITH tasks AS (
         lag(command_speed_mps) OVER episode AS command_mps, -- in force until this step
         lag(command_speed_mps, 2) OVER episode AS command_before_mps,
         lag(command_speed_mps, 3) OVER episode AS command_long_before_mps,
-        -- Without a new pose, or without a gyroscope, the column has a copy of the wheels' value.
+        -- Ingest copies the wheels' value to these columns if there is no new pose, or no gyroscope.
         localised_speed_mps <> wheel_speed_mps AS has_pose,
         gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro
     FROM cleared

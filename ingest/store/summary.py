@@ -217,7 +217,7 @@ def _of_episodes(
 
 
 def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
-    """Cut rows into parts of about STRETCH_ROWS; return indices of each first and past-last row.
+    """Cut the rows into parts of about STRETCH_ROWS; return (first row, one past the last) of each.
 
     No episode is in two parts. If the rows of an episode are not contiguous, all rows are one part.
     """
@@ -282,7 +282,7 @@ def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
 
 SKETCH_HASHES = 256
 MIN_HASHES = 3  # least number of hashes that two recordings of the same drive share
-LARGELY = 0.5  # least share of the smaller recording's distinctive rows that they share
+LARGELY = 0.5  # and least part of the smaller recording's distinctive rows that is in both
 NEARLY_ALL = 0.95  # less than 1: near its cut, a part has rows that the whole does not have
 # Errors if another recording was replaced meanwhile or is damaged: the ingest ignores them.
 UNREADABLE = (OSError, StoreError, pa.ArrowException)
@@ -431,7 +431,7 @@ def find_repeat(
     """Return the stored recording that repeats the most of the new rows, or None.
 
     `mine` are the new rows' `distinctive` hashes. `rows()` returns the new rows, and
-    `read(recording_id, ingest_id)` those of a stored recording; they are called if a sketch fits.
+    `read(recording_id, ingest_id)` a stored recording's. Both are called if a sketch looks alike.
     """
     found = []
     for one in sharing(mine, list(sketches)):

@@ -48,7 +48,7 @@ class EpisodeRows:
     episode: Ints  # (R,) index of the episode
     step: Ints  # (R,) index of the step in its episode
     is_end: Bools  # (R,)
-    signals: Signals  # leading axis R; signals of the route are for the route of the row's episode
+    signals: Signals  # leading axis R; route signals use the route of the row's episode
     labels: dict[str, Bools]  # name of an evaluated condition -> whether it holds, (R,)
     custom: pa.Table  # (R,) the profile's own signals
     probabilities: dict[str, F32]  # condition with a probability rule -> (R,); NaN: unknown

@@ -33,7 +33,7 @@ FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
 LOG = "_delta_log"  # folder of a table's log
 _LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
-_SHORT = 1024  # bytes; only smaller commits are checked: one cut after commitInfo has a third
+_SHORT = 1024  # bytes; only smaller commits are checked: cut after commitInfo, one has 1/3 of it
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
@@ -268,7 +268,7 @@ def _features(
 ) -> Iterator[tuple[str, str]]:
     """Yield each feature that a table uses, with a phrase that names it in error messages.
 
-    If the protocol's `version` is above `newest`, which Restock knows, yield "" (no feature) first.
+    If the protocol's `version` is above the `newest` that Restock knows, yield "" for it first.
     """
     if version > newest:
         yield "", f"version {version} of the protocol ({key})"

@@ -310,7 +310,7 @@ class StoreWriter(TableCommits):
         for name in (RECORDINGS, TRANSITIONS):
             if not self.path.has_table(name):
                 continue
-            # An old file may still belong to a version within the window: vacuum leaves such out.
+            # An old file may still belong to a version within the window: vacuum leaves it out.
             stale = self._written_before(name, retention_hours)
             if not stale.difference(file.path for file in self.files(name)):
                 continue
@@ -332,8 +332,8 @@ class StoreWriter(TableCommits):
     def _written_before(self, name: str, retention_hours: int) -> set[str]:
         """Return the files in a folder that are older than the window.
 
-        This goes by the files' write times, not by Delta's log: compaction may write the file of a
-        manifest again that the log has removed, if a version within the window needs it.
+        This goes by the files' write times, not by Delta's log: compaction may rewrite the file of
+        a manifest that the log has removed, if a version within the window needs it.
         """
         before_s = time.time() - retention_hours * 3600
         return {path for path, at_s in self.path.times(name).items() if at_s <= before_s}
@@ -400,7 +400,7 @@ class Compacted:
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
     summaries: int = 0  # new summaries of recordings whose rows another tool changed
-    changed_meanwhile: int = 0  # files left in groups of which another writer has replaced a file
+    changed_meanwhile: int = 0  # files left unjoined, as another writer replaced one of their group
     version: int | None = None  # version of `transitions` that was committed last; None: no commit
 
 
@@ -422,9 +422,9 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
         if store.path.has_table(RECORDINGS):
             _Fold.of(store, changed).count(done)
         return done
-    if changed:  # summaries first: joined rows count as Restock's, so theirs will be trusted
+    if changed:  # summaries first: rows joined by Restock count as its own, with trusted summaries
         fold(store, done, changed)
-    for group in groups:  # if not `changed`, rows first: a damaged file leaves manifests unchanged
+    for group in groups:  # else rows first, so that a damaged file leaves manifests unchanged
         _merge_rows(store, group, done)
     if not changed:
         fold(store, done)
