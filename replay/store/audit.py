@@ -251,7 +251,7 @@ def check_thresholds(
 ) -> None:
     """Refuse thresholds that no audit uses.
 
-    If `others` may exist besides `audits`, unknown names are refused only if they look misspelt.
+    If other audits may exist (`others`), unknown names are refused only if they look misspelt.
 
     Raises:
         ConfigError: an unknown name of an audit or threshold, or a value of another type than the
@@ -326,7 +326,7 @@ class Capacity:
     cells_share: float  # required share of the cells
     effective_episodes: float  # required number of effective episodes
     rows_for_cells: int  # smallest number of newest rows that keeps `cells_share`
-    rows_for_episodes: int | None  # like it, for `effective_episodes`; None: too few in all rows
+    rows_for_episodes: int | None  # same for `effective_episodes`; None: all rows have fewer
     half_share: float  # share of the cells that the newest half of the rows keeps
     curve: list[dict[str, Any]]  # a row per capacity: cells, cells_share, conditions, episodes, …
 

@@ -194,8 +194,8 @@ class Definitions:
         replaced: names of views -> function that replaces them by tables when a query names one;
             this takes too long to do when a query only lists views.
 
-    `computed` maps names of tables and macros to a function that creates them, for those computed
-    in Python. `made` has the names of the views and macros created so far.
+    `computed` maps names of tables and macros to the Python functions that compute them. `made` has
+    the names of the views and macros created so far.
     """
 
     def __init__(
@@ -327,7 +327,7 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Replace views that many of these queries use by tables in memory, until the block ends."""
+    """Copy views that queries often read into tables in memory, which replace them in the block."""
     owner = _definitions_of(connection)
     if owner is None:
         yield

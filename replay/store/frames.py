@@ -36,7 +36,7 @@ class CameraFrame:
     stamp_ns: int  # time of the frame on the recording's alignment clock
     age_s: float  # age of the frame at the step
     size_bytes: int
-    sha256: str  # hash of the frame's bytes when they were recorded
+    sha256: str  # hash of the frame's bytes as recorded
     source_file: str
     data: bytes
     layout: ImageLayout

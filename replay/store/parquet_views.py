@@ -174,7 +174,7 @@ def literal(value: object) -> str:
 
 
 _TEXT = pa.dictionary(pa.int32(), pa.string())
-FEW_FILES = 64  # to read so many files one by one is faster than to import Arrow's data sets
+FEW_FILES = 64  # up to so many files are read one by one: faster than to import Arrow's data sets
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class StoredTable:
 def manifest_tables(
     place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
 ) -> tuple[StoredTable, StoredTable]:
-    """Return two tables of the manifests of these transition files, each with some columns.
+    """Return the manifests of these transition files as two tables, which split the columns.
 
     `stored_summaries` has ingest ids and summaries, and `stored_recordings` all other columns.
     """

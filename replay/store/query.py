@@ -52,7 +52,7 @@ def query(
 
     Raises:
         StoreError: a file of the store is damaged or missing.
-        QueryError: DuckDB refused a statement, a statement would write, or the text has none.
+        QueryError: DuckDB refused a statement, a statement would write, or the text is empty.
     """
     if _COUNT.fullmatch(text) and is_own(connection, "transitions"):
         text = _COUNTED
@@ -214,9 +214,9 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def found(
     connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
 ) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Return column names and rows of a query with `$name` parameters, with times as by `values`.
+    """Return column names and rows of a query with `$name` parameters; times are as in `values`.
 
-    Without such times, the query is bound only once: with many views, binding takes longest.
+    Without such times, the query is bound once: with many views, binding takes longer than running.
     """
     connection.execute(text, given)
     columns = connection.description or []

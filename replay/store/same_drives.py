@@ -33,7 +33,7 @@ def install_shared_rows(
     """Replace the connection's view `shared_rows` by a table computed from manifests.
 
     `manifests(columns)` reads columns of all manifests, and is called twice. `recordings` maps
-    ingests to recordings; all other ingests are ignored. `rows` is the number of their rows.
+    ingests to recordings, and others are ignored; `rows` counts the rows of the ingests in it.
     """
     repeats = RepeatFilter(rows)
     for _, _, rows_of in _distinctive_rows(manifests(("ingest_id", CONTENT)), recordings):
@@ -74,7 +74,7 @@ class RepeatFilter:
         bits = min(max(int(4 * count).bit_length(), _MIN_BITS), _MAX_BITS)
         self._shift = np.uint64(64 - bits)
         self._marks = np.zeros(1 << bits, np.uint8)  # per hash value: bit 0 seen, bit 1 seen again
-        self._last = np.zeros(MARKED << 4, np.int32)  # low bits of a hash value -> its last index
+        self._last = np.zeros(MARKED << 4, np.int32)  # low bits of a hash -> last index with them
 
     def add(self, values: NDArray[np.integer]) -> None:
         """Mark these 64-bit numbers, (n,)."""

@@ -3,7 +3,7 @@
 -- clock. This view scans the rows; if manifests have the hashes, same_drives.py reads only those.
 CREATE OR REPLACE VIEW shared_rows AS
 WITH places AS (
-    -- Places in several recordings. Few rows are at such a place, and only those are read whole.
+    -- Hashes of task, action and pose that are in several recordings: only their rows are read whole.
     SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
     FROM transitions
     GROUP BY ALL
