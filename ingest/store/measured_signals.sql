@@ -21,7 +21,7 @@ WITH tasks AS (
         FROM recordings
     )
 ), cleared AS (
-    -- Window functions keep all these columns in memory: only needed ones, with sectors in half the bytes.
+    -- Window functions keep all this in memory: only needed columns, and sectors as observed, which halves their bytes.
     SELECT
         recording_id,
         episode_id,

@@ -98,7 +98,7 @@ FROM (
 CROSS JOIN (SELECT count(*) AS all_recordings FROM recordings)
 WHERE recordings = all_recordings;
 
--- Python replaces this view by measured values when a query names it (novelty.py). Without Python it is null.
+-- Python replaces this view by measured values when a query names it (novelty.py). Elsewhere it is null.
 CREATE OR REPLACE VIEW novelty AS
 SELECT transition_id, CAST(NULL AS FLOAT) AS novelty, CAST(NULL AS BOOLEAN) AS novel
 FROM transitions;
