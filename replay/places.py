@@ -38,7 +38,7 @@ def open_place(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Yield a connection with the views of a store, a run or a panel, or the topics of recordings.
 
-    Query it with `query`, or call `install_named` first: they create the views that a query names.
+    Views are created when they are needed: use `query`, or call `install_named` with the SQL first.
 
     Args:
         path: the place: a folder, or `s3://bucket/prefix` for a store; `store@12` for a version; a
@@ -88,7 +88,7 @@ def open_place(
         if confined:
             _confine(connection, None if topics else path)
         yield connection
-        del topics  # kept until here because it creates tables on demand
+        del topics  # the object had to exist until here: it creates tables on demand
 
 
 def _topics(
@@ -96,7 +96,7 @@ def _topics(
 ) -> object:
     """Install the topics of recordings as tables; return the object that creates them."""
     from restock.ingest.containers.open_recording import recordings_in
-    from restock.replay.topics import Topics  # imported here because it pulls in rosbags
+    from restock.replay.topics import Topics  # imported here as it imports rosbags
 
     try:
         recordings_in(path)
@@ -111,7 +111,7 @@ def _topics(
     return Topics(connection, path, lost)
 
 
-# Table of a panel or run -> query for its rows by condition.
+# Table of a panel or run -> query that counts its rows by condition.
 _COVERAGE = {
     "rows": "SELECT condition, count(*) AS rows FROM rows GROUP BY ALL ORDER BY ALL",
     "replay_audit": "SELECT condition, count(*) AS sampled FROM replay_audit GROUP BY ALL ORDER BY"
@@ -189,7 +189,7 @@ class Place:
 
 
 def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None:
-    """Restrict the connection to the files of a folder, without Python objects; None: no files."""
+    """Allow a connection only the files of a folder (None: no files), and no Python objects."""
     folders = [] if folder is None else [str(folder), str(folder.absolute())]
     listed = ", ".join(map(literal, folders))
     connection.execute(
@@ -199,7 +199,7 @@ def _confine(connection: duckdb.DuckDBPyConnection, folder: Path | None) -> None
 
 
 def add_computed_tables(store: Store) -> None:
-    """Register the table macros that Python computes; they are created when a query names them."""
+    """Register the tables `mixture(…)`, `mixture_rows(…)` and `gaps(…)`, created when queried."""
     store.add_tables(("mixture", "mixture_rows"), _install_mixtures)
     store.add_tables(("gaps",), _install_gaps)
 
@@ -217,7 +217,7 @@ def _install_gaps(store: Store) -> None:
 
 
 def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
-    """Return kind ("panel" or "run") -> path for places to query together with a store.
+    """Return kind ("panel" or "run") -> path of places that are queried together with a store.
 
     Raises:
         StoreError: a place is neither a panel nor a run, or there are two of a kind.
@@ -238,7 +238,7 @@ def beside_of(places: Iterable[str | Path]) -> dict[str, Path]:
 
 def kind_beside(place: str | Path) -> str | None:
     """Return "panel" or "run" by the files in a folder; None if it is neither."""
-    with suppress(OSError, ValueError):  # a query is too long for a path
+    with suppress(OSError, ValueError):  # if `place` is a query, it is no valid path
         for kind, file in (("panel", "panel.json"), ("run", RUN_CONFIG)):
             if (Path(place) / file).is_file():
                 return kind

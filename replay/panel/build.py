@@ -51,14 +51,14 @@ from restock.replay.plan.plan import AllStores, PanelPlan, PinnedStore, all_stor
 from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
-# Columns that a table must have for any mixture.
+# Columns that a table with the columns of a store's `transitions` must have, whatever the mixture.
 _NEEDED = (
     *("transition_id", "recording_id", "episode_id", "episode_index", "step_index"),
     *("observation", "action", "reward", "next_observation", "terminated", "truncated"),
     *("primary_condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "stamp_ns", "pose_x_m", "pose_y_m", "task_hash"),
 )
-# Columns that a table of any task must have. It is recognised by its lack of `episode_id`.
+# Columns that a table of any task must have. A table without `episode_id` counts as such a table.
 _OF_ANY_TASK = (
     "observation",
     "action",
@@ -68,7 +68,7 @@ _OF_ANY_TASK = (
     "episode",
     "condition",
 )
-# Error message -> SQL predicate of `filled` for rows with this error.
+# Error message -> SQL predicate that is true for rows of the table `filled` with this error.
 _FAULTS = {
     "row {row} lacks its observation, reward, end or episode": (
         "NOT coalesce(len(observation) > 0, false) OR reward IS NULL OR episode IS NULL"
@@ -162,7 +162,7 @@ def open_source(
         return
     with duckdb.connect() as connection:
         left_out = _register(connection, transitions, where)
-        # In a store's Parquet, the column `primary_condition` of its view is named `condition`.
+        # A store's Parquet files name the column `condition`; the view names it `primary_condition`.
         has = [*map(str.casefold, connection.table("given").columns)]
         renamed = "" if "primary_condition" in has else "RENAME (condition AS primary_condition)"
         known, logged = ("EXCLUDE (logged_ns)", "logged_ns, ") if "logged_ns" in has else ("", "")
@@ -190,7 +190,7 @@ def open_source(
 
 
 def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str) -> dict[str, int]:
-    """Register a table as `given`, filled in if it is of any task.
+    """Register a table as `given`; a table of any task is converted to the columns of a store.
 
     Returns reason -> number of rows left out. Raises ArgumentError or StoreError if columns are
     missing or have other types.
@@ -221,8 +221,8 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str
 def _convert_any_task(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, where: str, remedy: str
 ) -> dict[str, int]:
-    """Replace `given` by rows in the form of a store; return reason -> number of rows left out."""
-    if not isinstance(table, pa.Table):  # a frame of pandas or Polars
+    """Give `given` the columns of a store's rows; return reason -> number of rows left out."""
+    if not isinstance(table, pa.Table):  # a data frame of pandas or Polars
         table = pa.table(table)
     connection.register("given", table.append_column("place", pa.array(np.arange(len(table)))))
     try:
@@ -248,7 +248,7 @@ def _convert_any_task(
 
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
-    """Return each column's kind of values ("numbers", "text", …), ignoring their width."""
+    """Return each column's kind of values ("numbers", "text", …), whatever their size in bits."""
     return dict(zip(relation.columns, map(_kind, map(str, relation.types)), strict=True))
 
 
@@ -261,7 +261,7 @@ def _kind(kind: str) -> str:
 
 
 def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
-    """Return the conditions and exposures that labels name; shipped ones have their definition."""
+    """Return the conditions and exposures that labels name, with shipped definitions if known."""
     found = []
     columns: dict[str, Kind] = {"conditions": "outcome", "exposures": "exposure"}
     for column in columns.keys() & set(connection.sql("FROM transitions LIMIT 0").columns):
@@ -369,7 +369,7 @@ def write_panel(
 def _write_all(
     packer: Packer, folder: Path, advance: Callable[[int], None]
 ) -> tuple[int, FileRecord]:
-    """Write the packed rows, and their metadata in a thread; see `Packer.write_rows`."""
+    """Write the packed rows, and meanwhile their metadata; return what `write_rows` returns."""
     stop = Event()
     with ThreadPoolExecutor(1, "restock-meta") as beside:
         meta = beside.submit(packer.write_meta, folder / META, folder / EVALUATION_SPLIT, stop)
@@ -377,7 +377,7 @@ def _write_all(
             written = packer.write_rows(folder / ROWS, advance)
             meta.result()
         finally:
-            stop.set()  # if packing rows failed, metadata need not be completed
+            stop.set()  # if packing rows failed, stop writing metadata
     return written
 
 
@@ -396,7 +396,7 @@ def _report_out_of_memory() -> Iterator[None]:
 
 
 def _address(store: str) -> str:
-    """Return the absolute path or URL of a store, so that a trace finds it from any folder."""
+    """Return a store's absolute path or URL, so that `restock trace` finds it from any folder."""
     place = Location.of(store)
     return str(place if place.folder is None else place.folder.resolve())
 
@@ -429,8 +429,8 @@ def _finish_file(path: Path) -> None:
 
 
 def _move_into_place(partial: Path, out: Path, force: bool) -> None:
-    """Rename the finished panel to `out`, after moving an old panel away if it is replaced."""
-    partial.chmod(0o755)  # mkdtemp lets only the owner in
+    """Rename the finished panel to `out`; with `force`, an old panel is moved away first."""
+    partial.chmod(0o755)  # mkdtemp created it for the owner only
     old = partial.with_name(partial.name + "-old")
     if force and (out / HEADER).is_file():
         with contextlib.suppress(FileNotFoundError):  # another process removed it
@@ -450,7 +450,7 @@ def _move_into_place(partial: Path, out: Path, force: bool) -> None:
 
 
 def _random_probability(task_json: str) -> float:
-    """Return each action's probability under uniform random choice; 0 if the task is unknown."""
+    """Return 1 / number of actions: an action's probability at random; 0 if the task is unknown."""
     if not task_json:
         return 0.0
     return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
@@ -461,7 +461,7 @@ def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
 
     `digest` is a hash of the rows.
     """
-    own = source.name if source.version < 0 else source.version  # a table's name has a hash
+    own = source.name if source.version < 0 else source.version  # a table's name contains its hash
     versions = [own, *(store.version for store in source.others)]
     named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()

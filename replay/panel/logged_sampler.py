@@ -41,22 +41,22 @@ class BatchDraw:
     """The logged rows of one batch."""
 
     rows: Ints  # (L,) row numbers in the panel
-    strata: Ints  # (L,)
+    strata: Ints  # (L,) stratum of each row
     weight: F32 | None  # (L,) importance weights; None: all 1
-    quota: F64  # (S,) shares by which they were drawn
+    quota: F64  # (S,) shares of the strata in this draw
 
 
 class LoggedSampler(Stateful):
-    """Samples logged rows for one learner. `sampler_for` builds one for a panel.
+    """Samples logged rows for one learner. `sampler_for` builds a sampler for a panel.
 
-    `controller` sets the shares, and `sampler` draws by them. A row that was drawn
-    `max_replays_per_row` times is replaced by a row of the same stratum that may still be drawn,
-    else by a row of another stratum (offline only), else it is left out.
+    `controller` sets the shares, and `sampler` draws rows by them. If a drawn row has already been
+    drawn `max_replays_per_row` times, a row of the same stratum that may still be drawn replaces
+    it, or else (offline only) a row of another stratum. Otherwise the batch has one row less.
 
     Args:
         rows: (n, W) the packed rows.
-        weights: importance weights: (n,), or weights that follow the shares; None: all 1.
-        rng: the generator for replacements.
+        weights: importance weights: (n,), or weights that change with the shares; None: all 1.
+        rng: the random generator that chooses replacements.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("sampler", "controller", "replays", "replaced", "_rng")
@@ -76,7 +76,7 @@ class LoggedSampler(Stateful):
         self.batch_size = sampler.batch_size  # used if `draw` gets no count
         if isinstance(weights, WeightsInForce):
             weights.set_shares(controller.shares)
-        # Draws of each row so far, if there is a limit.
+        # Number of times that each row was drawn, counted only if there is a limit.
         limit = controller.max_replays
         self.replays: NDArray[np.int32] | None = None
         if limit is not None:
@@ -96,7 +96,7 @@ class LoggedSampler(Stateful):
         return changed
 
     def replan(self, planned: PlannedDraws) -> None:
-        """Plan for another number of draws from the next batch on."""
+        """Replace the planned draws from the next batch on."""
         if self.controller.replan(planned):
             self._apply_shares()
 
@@ -151,7 +151,7 @@ class LoggedSampler(Stateful):
     def _enforce_limit(
         self, rows: Ints, strata: Ints, weight: F32 | None, limit: int
     ) -> tuple[Ints, Ints, F32 | None]:
-        """Count the drawn rows (L,), and replace those beyond the limit."""
+        """Count the drawn rows (L,), and replace rows that were drawn more often than `limit`."""
         replays = self.replays
         if replays is None:
             raise RuntimeError("draws are not counted")
@@ -165,7 +165,7 @@ class LoggedSampler(Stateful):
             weight = weight.copy()
         for place in beyond.tolist():
             row, stratum = int(rows[place]), int(strata[place])
-            if replays[row] <= limit:  # the row was replaced elsewhere in this batch
+            if replays[row] <= limit:  # replacing another draw of this row was enough
                 continue
             replays[row] -= 1
             self.replaced[stratum] += 1
@@ -182,15 +182,15 @@ class LoggedSampler(Stateful):
     def _replacement(self, stratum: int, limit: int) -> tuple[int, int] | None:
         """Return a row that may still be drawn, and its stratum; None if there is none.
 
-        It tries the given stratum first, then (offline only) the others in random order, weighted
-        by share.
+        The given stratum is tried first, then (offline only) the others in a random order that
+        favours large shares.
         """
         replays, shares = self.replays, self.controller.shares
         if replays is None:
             return None
         others = self._rng.permutation(len(shares))
         by_share = sorted(others.tolist(), key=lambda s: -shares[s] * self._rng.random())
-        if self.controller.online:  # the ring replaces missing rows
+        if self.controller.online:  # fresh rows will fill the batch
             by_share = []
         for code in [stratum, *by_share]:
             members = self._stratum_rows[code]
@@ -227,7 +227,7 @@ def sampler_for(
 
     Args:
         batch_size: logged rows of a batch.
-        seed: seed of the draws: an integer of at least 0, or several.
+        seed: one or several integers of at least 0 that seed the draws.
         planned: number of draws, over which `max_replays_per_row` is spread; default: the
             mixture's `planned_draws`.
         logs_share: share of logged rows in an online batch; default: the mixture's.
@@ -295,7 +295,7 @@ def sampler_by_shares(
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
-    """Return a mixture's `planned_draws` as draws online."""
+    """Return a plan with a mixture's `planned_draws`, all of them online."""
     return PlannedDraws(online=float(mixture.planned_draws))
 
 

@@ -23,7 +23,7 @@ from restock.replay.store.store import Store
 if TYPE_CHECKING:
     from restock.replay.plan.plan import PanelPlan
 
-# Columns of `mixture` and their types: fields of `Stratum`, two of them renamed as in runs.
+# Columns of `FROM mixture(name)` -> types: fields of `Stratum`, two of them named as in runs.
 STRATA = {
     "stratum": "VARCHAR",
     "source": "VARCHAR",
@@ -60,7 +60,7 @@ _RENAMED = {"stratum": "name", "drawn_share": "share"}  # column -> field of `St
 
 
 def install_mixtures(store: Store) -> None:
-    """Create both macros in a store's connection."""
+    """Create the macros `mixture(name)` and `mixture_rows(name)` in a store's connection."""
     tables = {"planned_strata": (STRATA, strata_table), "planned_rows": (ROWS, rows_table)}
     script = files("restock.replay.panel") / "mixture_tables.sql"
     install_planned(store, ("mixture", "mixture_rows"), tables, script, _plan)
@@ -82,13 +82,13 @@ def install_planned(
     script: Traversable,
     plan: Callable[[Store, str], T],
 ) -> None:
-    """Create macros in a store's connection whose rows come from a plan in Python.
+    """Create table macros in a store's connection that return rows of a plan, made in Python.
 
     Args:
         macros: names of the macros; each takes the name of a mixture.
-        tables: SQL function that `script` calls -> its columns, and what turns a plan into a table.
-        script: the SQL that creates the macros.
-        plan: plans a mixture, given its name and a second `Store` of the same version.
+        tables: name of a SQL function -> its columns, and a function from a plan to its table.
+        script: the SQL that creates the macros, which call the functions of `tables`.
+        plan: plans a mixture; its arguments are another `Store` of the same version, and the name.
     """
     limit = store.bare.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
     path, version = store.path, store.version
@@ -107,7 +107,7 @@ def install_planned(
 def _check_names(macros: Sequence[str], text: str) -> None:
     """Raise ConfigError if a query calls one of these macros with a mixture that cannot be read.
 
-    Otherwise the error would come when rows are fetched, wrapped by DuckDB.
+    Otherwise the error would only appear when rows are fetched, inside an error of DuckDB.
     """
     from restock.replay.mixture.mixture import load_mixture
 
@@ -143,7 +143,7 @@ def _install_function(
         return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), structs)
 
     fields = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
-    # Declared to have side effects so that the optimiser does not fold it into a constant.
+    # Declare side effects: otherwise DuckDB's optimiser may replace the call by a constant.
     connection.create_function(
         function,
         lists,
@@ -155,7 +155,7 @@ def _install_function(
 
 
 def _changed_ns(name: str) -> int:
-    """Return the modification time of a mixture's file, so that a changed file is planned again."""
+    """Return when a mixture's file was modified (ns): a changed file must be planned again."""
     path = Path(name)
     return path.stat().st_mtime_ns if path.is_file() else 0
 

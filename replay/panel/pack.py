@@ -45,9 +45,9 @@ from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import row_columns, row_width
 
-BLOCK_ROWS = 512  # packed rows written together
+BLOCK_ROWS = 512  # packed rows that are written together
 HELD_BYTES = 128 << 20  # largest size of unfinished blocks in memory
-WRITERS = 2  # threads
+WRITERS = 2  # threads that write blocks
 WAITING_BYTES = 32 << 20  # largest size of full blocks that wait to be written
 
 
@@ -55,26 +55,26 @@ class Values(NamedTuple):
     """Values of some columns for rows (m,)."""
 
     columns: slice
-    held: NDArray[Any]  # (m, c), or (n, c) with `of`
-    of: Ints | None = None  # (m,) index into `held` for each row
+    held: NDArray[Any]  # (m, c), one entry per row; with `of`, (n, c) in any order
+    of: Ints | None = None  # (m,) index of each row's entry in `held`
 
 
 class PackedFile:
-    """Writes a file of rows (n, W) float32; parts of rows come in any order, each part once.
+    """Writes a file of rows (n, W) float32 from parts of rows, each put once, in any order.
 
     Blocks are written when they are full. Unfinished blocks stay in memory; if there are too many,
-    the oldest are written and later read back. Use it as a context manager, which waits for pending
-    writes at the end.
+    the oldest are written and later read back. Use the object as a context manager: it waits for
+    pending writes at the end.
     """
 
     def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
         self._rows, self._width, self._parts = rows, width, parts
         self._path = path
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts received, by block
+        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # block -> number of parts put
         self._held: dict[int, F32] = {}
         self._writers = ThreadPoolExecutor(WRITERS, "restock-pack")
-        self._writing: dict[int, Future[None]] = {}  # by block, oldest first
+        self._writing: dict[int, Future[None]] = {}  # block -> its pending write
 
     def __enter__(self) -> PackedFile:
         return self
@@ -146,19 +146,19 @@ class PackedFile:
         self._writing[number] = self._writers.submit(self._store, number, held)
 
     def _wait(self, at_most: int) -> None:
-        """Wait until at most `at_most` writes are pending; raise errors of finished ones."""
+        """Wait until at most `at_most` writes are pending; raise errors of finished writes."""
         while len(self._writing) > at_most:
             self._writing.pop(next(iter(self._writing))).result()
 
     def _store(self, number: int, held: F32) -> None:
         rest, place = held.data.cast("B"), number * self._block_bytes
-        while rest:  # a short write continues here; a full disk raises OSError
+        while rest:  # pwrite may write only a part; a full disk raises OSError
             written = os.pwrite(self._file, rest, place)
             rest, place = rest[written:], place + written
 
 
 def _read_into(out: F32, file: int, at: int) -> bool:
-    """Fill `out` with the bytes of a file from `at` on; return False if the file is too short."""
+    """Fill `out` with the file's bytes from offset `at`; return False if the file is too short."""
     rest = out.data.cast("B")
     while rest:
         got = os.preadv(file, [rest], at)
@@ -173,10 +173,10 @@ class _RowRanges:
 
     def __init__(self, rows: Ints) -> None:
         self._rows = rows
-        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # number of breaks before each
+        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # breaks up to each row
 
     def __call__(self, begin: int, end: int, base: int = 0) -> Ints | slice:
-        """Return the row numbers at [begin, end), minus `base`."""
+        """Return the row numbers from index `begin` to `end`, minus `base`."""
         if self._breaks[begin] != self._breaks[end - 1]:
             return self._rows[begin:end] - base
         first = int(self._rows[begin]) - base
@@ -189,7 +189,7 @@ FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
     ' + reward)"'
 )
-# Columns with few repeated values.
+# Columns that are written without a dictionary, because few of their values repeat.
 _NO_DICTIONARY = ("transition_id", "stamp_ns", "logged_ns", "reward")
 _SPLIT_COLUMNS = (
     "transition_id",
@@ -204,14 +204,14 @@ _SPLIT_COLUMNS = (
 
 
 def continues_return(rows: pa.Table, random_probability: float) -> Bools:
-    """Return whether a row's n-step return may go on to the next row, (N,).
+    """Return for each row whether its n-step return may include the next row, (N,).
 
-    It may if that row is the next step of the same episode, and the same policy chose its action
-    without exploring. `rows` (N) are META_COLUMNS in order. `random_probability` is an action's
-    probability under random choice: an action less likely than this counts as exploration. 0 means
-    that it is unknown.
+    It may if the next row is the next step of the same episode, and the same policy chose its
+    action without exploring. `rows` (N) have META_COLUMNS and are sorted. `random_probability` is
+    the probability of an action under random choice, 0 if unknown: an action that was less likely
+    counts as exploration.
     """
-    # A missing version counts as version "" of its policy.
+    # A policy without a version has version "".
     version = pc.coalesce(rows["behaviour_version"].cast(pa.string()), "")
     version = version.combine_chunks().dictionary_encode()
     policy = codes(rows, "behaviour_policy").astype(np.int64)
@@ -233,7 +233,7 @@ def n_step_horizon(continues: Bools, n_step: int) -> Ints:
     horizon = np.ones(len(continues), np.int64)
     unbroken = np.ones(len(continues), np.bool_)
     for ahead in range(1, min(n_step, len(continues) + 1)):
-        # Row i reaches i + ahead if it reaches i + ahead - 1 and that row continues.
+        # The return of row i includes row i + ahead if it includes the row before, which continues.
         step = np.zeros(len(continues), np.bool_)
         step[: len(continues) - ahead + 1] = continues[ahead - 1 :]
         unbroken &= step
@@ -242,7 +242,7 @@ def n_step_horizon(continues: Bools, n_step: int) -> Ints:
 
 
 class Packer:
-    """Packs the rows of one plan; `random_probability` as in `continues_return`."""
+    """Packs the rows of one plan. For `random_probability` see `continues_return`."""
 
     def __init__(
         self,
@@ -257,12 +257,12 @@ class Packer:
         self._ids: Ints = plan.rows["transition_id"].to_numpy()
         self._reward: F32 = plan.rows["reward"].to_numpy()
         count = len(plan.weight)
-        # For each packed row: its position in the source, and that of its return's last step.
+        # Positions in the source of each packed row, and of the last row that its return includes.
         self.chosen: Ints = np.memmap(scratch / "chosen", np.int64, "w+", shape=(count,))
         self.last: Ints = np.memmap(scratch / "last", np.int64, "w+", shape=(count,))
         at = 0
         for begin, end, rows in self._stretches():
-            # Includes the following rows that a return can reach.
+            # Also read the rows after `end` that a return can include.
             part = plan.rows.slice(begin, end - begin + self.mixture.n_step)
             horizon = n_step_horizon(
                 continues_return(part, random_probability), self.mixture.n_step
@@ -272,12 +272,12 @@ class Packer:
             at += len(rows)
 
     def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
-        """Yield ranges of the source's rows, and which rows in each are packed."""
+        """Yield ranges [begin, end) of the source's rows, and which rows in each are packed."""
         for begin, end in stretches(len(self.plan.rows)):
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 
     def digest(self) -> str:
-        """Return a hash of the rows: ids, strata, horizons, weights."""
+        """Return a hash over the ids, strata, horizons and weights of the packed rows."""
         digests = [hashlib.blake2b(digest_size=8) for _ in range(4)]
         at = 0
         for begin, _, rows in self._stretches():
@@ -309,10 +309,10 @@ class Packer:
         names = "transition_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
         places = Places(self._ids)
-        # Two parts of a row: observation, action and reward; next observation and discount.
+        # A row has two parts: observation, action and reward; next observation and discount.
         with (
             PackedFile(path, len(self.chosen), row_width(size), parts=2) as rows,
-            any_order(self.connection),  # each row's place follows from its id
+            any_order(self.connection),  # allowed, as a row's place follows from its id
         ):
             for batch in filter(len, self.connection.sql(query).to_arrow_reader(at_a_time)):
                 place = places.of(batch.column("transition_id").to_numpy())
@@ -340,7 +340,7 @@ class Packer:
             Values(part["action"], batch.column("action").to_numpy()[:, None], packed),
             Values(part["reward"], returns[:, None], packed),
         )
-        # Packed rows whose return ends with a row of this batch take its next observation.
+        # A row's next observation completes the packed rows whose return ends with that row.
         first, behind = _find_ranges(self.last, place)
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
@@ -366,12 +366,12 @@ class Packer:
             )
 
     def write_meta(self, meta: Path, evaluation_split: Path, stop: Event) -> None:
-        """Write the metadata of packed rows, and the evaluation split, in order; until `stop`."""
+        """Write the metadata of packed rows and of the evaluation split; end early if `stop`."""
         held = np.flatnonzero(self.plan.evaluation_split)
         with _writer(evaluation_split) as write:
             for begin in _groups(len(held), stop):
                 part = self.plan.rows.select(_SPLIT_COLUMNS).take(pa.array(held[begin]))
-                # Used by the audit `leakage`.
+                # The audit `leakage` uses this column.
                 split_by = pa.array([self.plan.split_by], pa.string())
                 column = pa.DictionaryArray.from_arrays(np.zeros(len(part), np.int8), split_by)
                 write(part.append_column("split_by", column))
@@ -393,7 +393,7 @@ class Packer:
 
 
 def _groups(rows: int, stop: Event) -> Iterator[slice]:
-    """Yield the row groups of a table of `rows` rows; an empty table has one empty group."""
+    """Yield the slices of row groups; an empty table has one empty group. End early if `stop`."""
     for begin in range(0, max(rows, 1), ROW_GROUP_ROWS):
         if stop.is_set():
             return
@@ -424,7 +424,7 @@ def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
 
 
 def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
-    """Reduce a dictionary to the values that occur, sorted: readers keep the whole dictionary."""
+    """Reduce a dictionary to values that occur, in order: readers load all of a dictionary."""
     used = column.indices.unique().drop_null()
     order = used.take(pc.array_sort_indices(used))
     codes = pc.index_in(column.indices, value_set=order)
@@ -437,8 +437,8 @@ def _is_finite(values: NDArray[np.float32], rows: Ints) -> bool:
 
 
 def _find_ranges(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
-    """Return begin and end of each value's range in an ascending array, (n,) each."""
-    # Values of one batch are mostly close together, so only a small part is searched.
+    """Return begin and end of the range of each value (n,) in an ascending array, (n,) each."""
+    # Values of one batch are mostly close together: search only the part that they can be in.
     low, high = np.searchsorted(ascending, [values.min(), values.max() + 1])
     near = np.asarray(ascending[low:high])
     begin, end = (low + np.searchsorted(near, values, side) for side in ("left", "right"))
@@ -446,5 +446,5 @@ def _find_ranges(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
 
 
 def _starts(counts: Ints) -> Ints:
-    """Return the begin of each of consecutive groups with these sizes."""
+    """Return where each group begins if groups of these sizes follow each other."""
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)

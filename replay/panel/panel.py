@@ -42,16 +42,16 @@ class FileRecord(msgspec.Struct, frozen=True):
     """Size and checksums of a file when it was written."""
 
     bytes: int
-    blake3: str  # of the whole file
-    sample: str  # of some of its blocks
+    blake3: str  # checksum of the whole file
+    sample: str  # checksum of some of its blocks
 
     @classmethod
     def of(cls, path: Path) -> FileRecord:
-        """Measure a file."""
+        """Compute the size and checksums of a file."""
         return cls(path.stat().st_size, checksum(path), sample_checksum(path))
 
     def check(self, path: Path, *, verify: bool) -> None:
-        """Raise PanelError if the file changed; the whole-file checksum needs `verify`."""
+        """Raise PanelError if the file changed; only with `verify` is the whole file read."""
         if sys.byteorder != "little":
             raise PanelError("panels need a little-endian machine", where=str(path))
         if not path.is_file():
@@ -98,7 +98,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 def seal(header: msgspec.Struct) -> bytes:
-    """Encode a header as indented JSON, with a checksum over its values."""
+    """Encode a header as indented JSON, with a checksum of its values."""
     values = msgspec.to_builtins(header)
     return msgspec.json.format(msgspec.json.encode(values | {"seal": _seal_of(values)}), indent=1)
 
@@ -153,7 +153,7 @@ class Header(msgspec.Struct, frozen=True):
     """The contents of panel.json."""
 
     id: str
-    store: str  # its absolute path or URL; for a table in memory, a name with a hash
+    store: str  # absolute path or URL of the store; for a table in memory, a name with a hash
     store_version: int  # of the store's Delta table; -1 for a table in memory
     task_hash: str
     task_json: str  # "" if unknown
@@ -166,7 +166,7 @@ class Header(msgspec.Struct, frozen=True):
     restock_version: str
     newest_ns: int  # when the source's newest row was logged
     logs_share: float  # share of logged rows in a batch
-    conditions: list[str]  # by priority, nominal last
+    conditions: list[str]  # names in order of priority, nominal last
     left_out: dict[str, int]  # reason -> rows of the source that are not in the panel
     effective_rows: float  # effective sample size of the weighted draws
     strata: list[Stratum]
@@ -174,10 +174,10 @@ class Header(msgspec.Struct, frozen=True):
     others: list[PinnedStore]  # stores besides the first
     ratios: list[RatioFit]  # fits of density ratios, if a correction uses them
     files: dict[str, FileRecord]
-    profile: str = ""  # name of the profile that read its rows; "" if unknown
+    profile: str = ""  # name of the profile by which rows were ingested; "" if unknown
     profile_toml: str = ""  # text of that profile, in case its file is missing; "" if unknown
-    as_of_ns: int | None = None  # date for ages; None without max_age_days in the mixture
-    split_by: str = ""  # what the evaluation split did; "": as its mixture says
+    as_of_ns: int | None = None  # moment that ages refer to; None without `max_age_days`
+    split_by: str = ""  # `by` of the evaluation split as it was done; "": as in the mixture
     split_note: str = ""  # what was held out instead of whole groups, or why nothing was
     warnings: list[str] = []  # the warnings of `restock mix`
 
@@ -312,7 +312,7 @@ class Panel:
         """
         try:
             table = self._read(META, [name]) if self._meta is None else self._meta
-        except PanelError:  # no such column, or a damaged file, for which this raises again
+        except PanelError:  # no such column, or the file is damaged: then `self.meta` raises again
             table = self.meta
         if name not in table.column_names:
             has = ", ".join(self.meta.column_names)
