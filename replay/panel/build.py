@@ -162,7 +162,7 @@ def open_source(
         return
     with duckdb.connect() as connection:
         left_out = _register(connection, transitions, where)
-        # A store's Parquet files name the column `condition`; the view names it `primary_condition`.
+        # A store's Parquet files call the column `condition`; views call it `primary_condition`.
         has = [*map(str.casefold, connection.table("given").columns)]
         renamed = "" if "primary_condition" in has else "RENAME (condition AS primary_condition)"
         known, logged = ("EXCLUDE (logged_ns)", "logged_ns, ") if "logged_ns" in has else ("", "")
