@@ -39,7 +39,7 @@ def stretches(rows: int) -> Iterator[tuple[int, int]]:
 
 
 class Places:
-    """An index from ids (N,) to their positions."""
+    """An index that finds the positions of ids in an array (N,)."""
 
     def __init__(self, ids: Ints) -> None:
         self._order = np.argsort(ids, kind="stable")  # fast: ids ascend within each recording
@@ -47,7 +47,7 @@ class Places:
 
     @property
     def repeats(self) -> int:
-        """Count the ids that repeat an earlier one."""
+        """Return the number of ids that repeat an earlier id."""
         return int((self._ids[1:] == self._ids[:-1]).sum())
 
     def of(self, ids: Ints) -> Ints:
@@ -56,9 +56,9 @@ class Places:
         return np.where(self._ids[place] == ids, self._order[place], -1)
 
 
-KEYS = ("episode_index", "step_index", "transition_id")  # sort keys after the recording
-COLUMNS_AT_A_TIME = 2  # sorted in parallel; a limit on memory
-_CODES_AT_A_TIME = 1 << 20  # codes per block when searching first appearances
+KEYS = ("episode_index", "step_index", "transition_id")  # sort keys within a recording
+COLUMNS_AT_A_TIME = 2  # columns that are sorted in parallel; more would need more memory
+_CODES_AT_A_TIME = 1 << 20  # codes per block when searching for first appearances
 
 
 def rows_in_order(
@@ -79,13 +79,13 @@ def rows_in_order(
         for name, values in zip(batch.schema.names, batch.columns, strict=True):
             if (known := texts.get(name)) is not None:
                 parts[name].append(_encode(values, known))
-            else:  # a copy: one column of DuckDB's batch would keep the whole batch in memory
+            else:  # copy the column: a reference to it would keep DuckDB's whole batch in memory
                 parts[name].append(pa.concat_arrays([values, values[:0]]))
 
     def whole(name: str) -> pa.Array:
         known = texts.get(name)
         kind = schema.field(name).type if known is None else _code_type(len(known))
-        # Later batches may have needed wider codes.
+        # Codes of early batches may have a narrower type than those of later ones.
         return pa.concat_arrays([pa.array([], kind), *(part.cast(kind) for part in parts[name])])
 
     ids = pa.array(list(texts["recording_id"]), pa.string())
@@ -111,7 +111,7 @@ def _code_type(size: int) -> pa.DataType:
 
 
 def _encode(column: pa.Array, known: dict[str, int]) -> pa.Array:
-    """Dictionary-encode text with `known`, adding new values to it."""
+    """Return the codes of texts in the dictionary `known`, after adding new texts to it."""
     local = column.cast(pa.string()).dictionary_encode()
     codes = pa.array(
         [known.setdefault(text, len(known)) for text in local.dictionary.to_pylist()],
@@ -123,11 +123,11 @@ def _encode(column: pa.Array, known: dict[str, int]) -> pa.Array:
 def _renumber(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
     """Renumber codes of `names` in order of first appearance.
 
-    The result then does not depend on which thread read its rows first.
+    Without this, codes would depend on which thread was first to read its rows.
     """
     wide = codes.cast(pa.int32()).fill_null(len(names)) if codes.null_count else codes
     code = wide.to_numpy()
-    first = np.full(len(names) + 1, len(code), np.int64)  # the last entry is for null
+    first = np.full(len(names) + 1, len(code), np.int64)  # where each code appears; last: null
     for begin in reversed(range(0, len(code), _CODES_AT_A_TIME)):
         some = code[begin : begin + _CODES_AT_A_TIME]
         first[some[::-1]] = np.arange(begin + len(some) - 1, begin - 1, -1)
@@ -154,7 +154,7 @@ _TEXT = (
 _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
 _VIEWS = "SELECT table_name FROM information_schema.tables"
 BATCH_ROWS = 65_536  # rows read at a time
-STORE_COLUMN = "mixture_store"  # a row's store, in a view of several (`replay.plan.plan`)
+STORE_COLUMN = "mixture_store"  # number of a row's store, in views over several stores
 
 
 def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
@@ -175,7 +175,7 @@ def read_candidates(
     """Read every row of the connection's `transitions`, sorted by recording, episode and step.
 
     The columns are META_COLUMNS, `task_hash`, `labelled`, `uncertain` (the row has an uncertain
-    condition), `store` (int, the row's store), and one boolean for each predicate of the mixture:
+    condition), `store` (number of the row's store), and one boolean per predicate of the mixture:
     `admitted`, `unsafe`, `stratum_0` …, and `state_0` … for strata with a predicate of the state
     alone. Text columns are dictionary-encoded in order of appearance. If the mixture's `uncertain`
     is "nominal", predicates see `conditions` without the uncertain ones. They may also use the
@@ -236,14 +236,14 @@ def read_candidates(
 
 
 def stored_view(connection: duckdb.DuckDBPyConnection) -> str:
-    """Return the cheapest table or view that contains the rows of `transitions`."""
+    """Return the name of the view with the rows of `transitions` that is cheapest to read."""
     views = connection.sql(_VIEWS).fetchall()
     return "stored_transitions" if ("stored_transitions",) in views else "transitions"
 
 
 @contextmanager
 def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Allow DuckDB to return rows in any order while the block runs, which is faster."""
+    """Allow DuckDB to return rows in any order while the block runs: that is faster."""
     connection.execute("SET preserve_insertion_order = false")
     try:
         yield
@@ -297,7 +297,7 @@ def without_measured_actions(
 
 
 def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    """Return the conditions and exposures that are unknown in every recording -> the reason."""
+    """Return the reason for each condition or exposure that is unknown in every recording."""
     if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
         return {}  # assume that all conditions are known
     rows: list[tuple[str, str]] = connection.sql(
@@ -329,8 +329,8 @@ def episodes_met(
 ) -> dict[str, list[tuple[int, int]]]:
     """Count the episodes that met each condition or exposure, by store.
 
-    Returns name -> (episodes that met it, episodes in which it is known) for each store. The
-    connection has a view of several stores; only rows that the mixture's `where` admits count.
+    Returns name -> one pair per store: episodes that met it, and episodes in which it is known. The
+    connection has a view over several stores; only rows that the mixture's `where` admits count.
     """
     held = "conditions" if mixture.uncertain == "keep" else _CERTAIN
     rows = (

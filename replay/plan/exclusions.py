@@ -22,19 +22,19 @@ from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.store.definitions import install_repeated_rows
 
 DAY_NS = 86_400 * 10**9
-# `by` of an evaluation split -> column and name of its groups; otherwise the groups are episodes.
+# `by` of an evaluation split -> column and name of its groups. Other values use episodes as groups.
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
-# If one whole episode is more than this multiple of the share, the end of an episode is held out.
+# If one whole episode is more than this multiple of the share, only the end of one is held out.
 _WHOLE_AT_MOST = 2.0
 GAP_S = 2.0  # seconds left out before the held-out end of an episode
 _GAP_AT_MOST = 0.25  # largest fraction of an episode that the gap may take
 _LEFT_AT_LEAST = 0.2  # fraction of an episode's rows that must remain for learning
-EPISODE_REPEATS = 3  # rows that repeat the evaluation split before a whole episode is left out
+EPISODE_REPEATS = 3  # an episode with so many rows that repeat the evaluation split is left out
 
 
 @dataclass
 class LeftOut:
-    """Rows (N,) that are left out, each counted under the first reason that applied to it."""
+    """Rows (N,) that are left out of a panel; each is counted under the first reason found."""
 
     gone: Bools
     admitted: Bools  # rows within the mixture's limits, including those held out for evaluation
@@ -50,7 +50,7 @@ class LeftOut:
 def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns: int) -> LeftOut:
     """Return the rows to leave out before strata are assigned.
 
-    `table` comes from `read_candidates`; ages are as of `as_of_ns`.
+    `table` comes from `read_candidates`; ages count back from `as_of_ns`.
 
     Raises:
         MixtureError: every row is too old, or some have no label and the mixture refuses that.
@@ -94,7 +94,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
 
 @contextmanager
 def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -> Iterator[None]:
-    """Prepare what `repeats_of` needs in a thread while the block runs.
+    """Prepare `repeats_of` in a thread while the block runs.
 
     The block must not use the connection. Raises StoreError if manifests cannot be read.
     """
@@ -110,10 +110,10 @@ def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -
 def repeats_of(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, places: Places, evaluation_split: Bools
 ) -> Bools:
-    """Find rows (N,) outside the evaluation split that repeat its steps under other ids.
+    """Find rows (N,) outside the evaluation split that repeat steps of the split under other ids.
 
-    This happens if a recording and a part of it, or two recordings of one drive, are in the store.
-    If `EPISODE_REPEATS` or more rows of an episode repeat the split's steps, all of its rows count.
+    A store has such rows if it contains a recording and a part of it, or two recordings of one
+    drive. If at least EPISODE_REPEATS rows of an episode repeat steps, all its rows are returned.
     Requires `repeats_installed` on the connection.
 
     Raises:
@@ -128,7 +128,7 @@ def repeats_of(
     copy, original = (found[name].to_numpy() for name in found.column_names)
 
     def held(ids: Ints) -> Bools:
-        place = places.of(ids)  # -1 if the row is not a candidate
+        place = places.of(ids)  # -1 if the row is not in `table`
         return np.asarray((place >= 0) & evaluation_split[place], np.bool_)
 
     originals = np.union1d(original[held(copy)], original[held(original)])
@@ -156,7 +156,7 @@ def leave_out_of_strata(
 ) -> Bools:
     """Leave out rows without a stratum, and rows beyond the cap per episode or recording.
 
-    Returns the rows beyond a cap, (N,): they still count for natural shares.
+    Returns the rows beyond a cap, (N,), because they still count for natural shares.
 
     Raises:
         MixtureError: rows without a stratum, if the mixture refuses them.
@@ -189,10 +189,10 @@ def beyond_cap(
     gone: Bools,
     seed: int,
 ) -> Bools:
-    """Find rows (N,) beyond the cap of their stratum and episode (or recording).
+    """Find the rows (N,) to drop so that `cap` rows stay per stratum and episode (or recording).
 
-    Which rows stay depends only on their ids and the seed, as with `row_number() OVER (PARTITION BY
-    stratum, episode ORDER BY hash(transition_id, seed))`.
+    Which rows stay depends only on their ids and the seed: the first by `row_number() OVER
+    (PARTITION BY stratum, episode ORDER BY hash(transition_id, seed))`.
     """
     rows = np.flatnonzero(~gone & (stratum != NO_STRATUM))
     order_of = scramble(table["transition_id"].to_numpy()[rows], seed)
@@ -211,14 +211,14 @@ class EvaluationRows:
     """The rows held out for evaluation, of N rows."""
 
     held: Bools  # (N,)
-    gap: Bools  # (N,) before the held-out end of an episode: neither learned from nor evaluated on
-    by: str  # what was done, as in `EvaluationSplit.by`; may differ from what was requested
-    note: str = ""  # what was held out instead, or why nothing was
-    warning: str = ""  # if far more was held out than requested
+    gap: Bools  # (N,) just before a held-out end of an episode: not in the panel, not in the split
+    by: str  # how rows were chosen, as in `EvaluationSplit.by`; may differ from the mixture's
+    note: str = ""  # what was held out instead of whole groups, or why nothing was
+    warning: str = ""  # set if far more was held out than requested
 
     @classmethod
     def none(cls, rows: int, note: str = "") -> EvaluationRows:
-        """Return a choice without held-out rows."""
+        """Return an object without held-out rows."""
         return cls(np.zeros(rows, np.bool_), np.zeros(rows, np.bool_), "none", note)
 
 
@@ -226,13 +226,13 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     """Choose the rows held out for evaluation.
 
     These are whole episodes, recordings, robots or sites, the latest episodes, or the end of each
-    episode. If there is a single episode, its end is held out. With few episodes, one whole episode
-    may contain all rows of a condition. If the one chosen is more than twice the requested share,
-    the end of the longest episode is held out instead; the other episodes then stay whole,
-    including their ends. Episodes without a row that the mixture's `where` admits are ignored.
+    episode. If there is a single episode, its end is held out. If a single episode is chosen and
+    has more than twice the requested share, it may contain all rows of a condition: then only the
+    end of the longest episode is held out, and nothing of the other episodes. Episodes without a
+    row that the mixture's `where` admits are ignored.
 
     Raises:
-        MixtureError: the rule would hold out everything, there is only one group, the mixture
+        MixtureError: the split would hold out everything, there is only one group, the mixture
             admits no row of a named robot, or it admits rows of an unknown robot or site.
     """
     episode = codes(table, "episode_id")
@@ -246,7 +246,7 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 
 
 def _choose_rows(table: pa.Table, mixture: Mixture) -> EvaluationRows:
-    """Choose rows as `split_for_evaluation` does, for a table without episodes to ignore."""
+    """Choose the rows for `split_for_evaluation`, from a table without episodes to ignore."""
     rule, seed = mixture.evaluation_split, mixture.seed
     if rule.is_empty:
         return EvaluationRows.none(len(table))
@@ -289,7 +289,7 @@ def _ends_of_episodes(
     np.minimum.at(first_ns, episode, stamp_ns)
     np.maximum.at(last_ns, episode, stamp_ns)
     long_s = (last_ns - first_ns) * 1e-9
-    # The gap would take too much of a shorter episode.
+    # Do not split shorter episodes: the gap would take too much of them.
     split = (long_s * _GAP_AT_MOST >= GAP_S)[episode]
     if only is not None:
         split &= episode == only
@@ -356,7 +356,7 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
             remedy='ingest more, or set [evaluation_split] by = "none" in a mixture of your own',
         )
     wanted = rule.share * len(table)
-    # At least one group, never all, and no more than needed.
+    # Hold out as few groups as reach the share: at least one, never all.
     count = int(np.searchsorted(np.cumsum(rows[order]), wanted)) + 1
     chosen = order[: min(count, len(order) - 1)]
     return np.isin(code, chosen)
@@ -368,5 +368,5 @@ def _hash(name: str, seed: int) -> int:
 
 
 def scramble(ids: Ints, seed: int) -> NDArray[np.uint64]:
-    """Return hashes of ids: the same on every machine and in any order of rows."""
+    """Return a hash of each id, which is the same on every machine and for any order of ids."""
     return splitmix64(ids.astype(np.uint64) + np.uint64((seed * GOLDEN + 1) % 2**64))

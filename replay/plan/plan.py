@@ -71,12 +71,12 @@ from restock.replay.store.store import Store
 
 
 class PinnedStore(msgspec.Struct, frozen=True):
-    """Another store of a panel, at a pinned version."""
+    """Another store of a panel, at the version that was read."""
 
     name: str
-    path: str  # as resolved
+    path: str  # resolved path
     version: int
-    repeated_rows: int  # rows of recordings that an earlier store has too, and are taken from there
+    repeated_rows: int  # rows not taken from it, as an earlier store also has their recordings
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class AllStores:
 def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> Iterator[AllStores]:
     """Open the mixture's other stores, and yield one view over them and the first store.
 
-    A relative path is resolved against `folder` (that of the mixture's file), or against the
-    working directory if `folder` is None. The first store's own views do not change.
+    Relative paths are resolved against `folder` (of the mixture's file), or against the working
+    directory if `folder` is None. The first store's own views do not change.
 
     Raises:
         StoreError: a store cannot be opened, lacks the requested version, or has no rows.
@@ -136,7 +136,7 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
 def _create_views(
     connection: duckdb.DuckDBPyConnection, first: Store, others: Sequence[tuple[OtherStore, Store]]
 ) -> list[int]:
-    """Create the views; return how many rows of each other store are also in an earlier store."""
+    """Create views over all stores; return the `repeated_rows` of each store but the first."""
     tables: dict[str, list[str]] = {"stored_transitions": [], "stored_recordings": []}
     repeated = []
     for number, store in enumerate([first, *(store for _, store in others)]):
@@ -182,25 +182,25 @@ LOGS = "logs"  # the name of the first store as a source
 
 @dataclass(frozen=True)
 class PanelPlan:
-    """The plan of a panel. Arrays (N,) are over all rows of the store, (n,) over the panel's."""
+    """The plan of a panel. Arrays (N,) are over all rows of the stores, (n,) over the panel's."""
 
     mixture: Mixture
     rows: pa.Table  # META_COLUMNS of all N rows, sorted by recording, episode, step
     task_hash: str
     stratum: NDArray[np.int16]  # (N,) -1: not in the panel
     weight: F32  # (n,) importance weights
-    beside: dict[str, NDArray[Any]]  # (n,) columns from which weights follow when shares change
-    evaluation_split: Bools  # (N,)
-    split_by: str  # what was done, as in `EvaluationSplit.by`; may differ from what was requested
+    beside: dict[str, NDArray[Any]]  # (n,) columns for computing weights again when shares change
+    evaluation_split: Bools  # (N,) rows held out for evaluation
+    split_by: str  # how they were chosen, as in `EvaluationSplit.by`; may differ from the mixture's
     split_note: str  # what was held out instead of whole groups, or why nothing was
     strata: tuple[Stratum, ...]
-    found: dict[str, F64]  # stratum that lacks rows -> its rows in each episode of the dictionary
+    found: dict[str, F64]  # stratum that lacks rows -> its rows in each episode of `rows`
     logs_share: float  # share of logged rows in a batch, over all stores
-    logs_share_wanted: float  # the same if all strata had enough rows
+    logs_share_wanted: float  # the value of `logs_share` if all strata had enough rows
     left_out: dict[str, int]  # reason -> number of rows not in the panel
     effective_rows: float  # effective sample size of the weighted draws
     newest_ns: int  # when the newest row was logged
-    as_of_ns: int | None  # date for ages; None without max_age_days
+    as_of_ns: int | None  # moment that ages count back from; None without `max_age_days`
     others: tuple[PinnedStore, ...] = ()  # stores besides the first
     uncertain_rows: int = 0  # admitted rows with an uncertain condition
     ratios: tuple[RatioFit, ...] = ()  # fits of corrections by density ratio
@@ -208,7 +208,7 @@ class PanelPlan:
 
     @property
     def panel_rows(self) -> Ints:
-        """Return which of the store's rows are in the panel, (n,)."""
+        """Return the numbers (n,) of the rows that are in the panel."""
         return np.flatnonzero(self.stratum != NO_STRATUM)
 
 
@@ -242,7 +242,7 @@ def plan_panel(
     if not mixture.odometry_as_command:
         table, measured = without_measured_actions(connection, table)
     task_hash = find_task_hash(table)
-    with repeats_installed(connection, mixture):  # reads manifests in a thread meanwhile
+    with repeats_installed(connection, mixture):  # meanwhile a thread reads manifests
         places = Places(table["transition_id"].to_numpy())
         if repeats := places.repeats:
             raise StoreError(
@@ -260,7 +260,7 @@ def plan_panel(
         del state
         split = split_for_evaluation(table, mixture)
     as_of_ns = (
-        time.time_ns() // 10**9 * 10**9  # whole seconds, so that `as_of` can repeat it
+        time.time_ns() // 10**9 * 10**9  # whole seconds can be written as `as_of`
         if mixture.as_of is None
         else nanoseconds(mixture.as_of)
     )
@@ -316,9 +316,9 @@ def plan_panel(
 def _find_members(
     table: pa.Table, strata: Sequence[ResolvedStratum], *, of_state: bool = False
 ) -> Bools:
-    """Return the rows that may be in each stratum, (N, S), by its predicate and unit.
+    """Return which rows may be in each stratum, (N, S), by the stratum's predicate and unit.
 
-    With `of_state`, use predicates of the state alone where strata have one.
+    With `of_state`, use the predicate of the state alone for strata that have one.
     """
     member = np.empty((len(table), len(strata)), np.bool_, order="F")
     episode = codes(table, "episode_id")
@@ -340,7 +340,7 @@ def _deal_by_store(
     state_code: NDArray[np.int16],
     counted: Bools,
 ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Deal the episodes of each store; return strata (N,), and strata by state alone (N,)."""
+    """Deal the episodes of each store to strata; return the new `stratum` and `state_code`."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     stratum, state_code = stratum.copy(), state_code.copy()
     numbers = pc.unique(table["store"]).to_pylist()
@@ -363,7 +363,8 @@ def _collect_sources(
 ) -> list[SourceRows]:
     """Return the rows of each store that may be drawn, and its share of a batch.
 
-    `logged` (N,) are rows that the mixture admits. Recordings without any do not count as logging.
+    `logged` (N,) are rows that the mixture admits; episodes of recordings without such rows do not
+    count in `SourceRows.logged`.
     `size` is the number of strata.
     """
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
@@ -404,7 +405,7 @@ def _merge_sources(
     as_of_ns: int,
     warnings: tuple[str, ...],
 ) -> PanelPlan:
-    """Merge the plans of all sources; source k's strata begin at k * S."""
+    """Merge the plans of all sources; the strata of source k begin at index k * S."""
     size = len(strata)
     code = np.full(len(table), NO_STRATUM, np.int16)
     state = np.full(len(table), NO_STRATUM, np.int16)
@@ -478,7 +479,7 @@ def _prefix(source: SourceRows) -> str:
 
 
 def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
-    """Return `effective_count` of share of the draws times weight over rows (n,), by blocks."""
+    """Return the effective number of rows; a row counts by its share of the draws x weight (n,)."""
     total = squares = 0.0
     for begin, end in stretches(len(code)):
         sizes = drawn[code[begin:end]] * weight[begin:end]

@@ -37,7 +37,7 @@ from restock.replay.plan.weights import (
 
 
 def explain_no_rows(rule: StratumRule) -> str:
-    """Return the text for a stratum without rows: what is wrong, and what to change."""
+    """Return what is wrong with a stratum without rows, and what to change, for a message."""
     if rule.name == NOMINAL and rule.where is None and rule.unit == "episode":
         return (
             "has no episode: each met the condition of another stratum; give the most frequent one"
@@ -48,7 +48,7 @@ def explain_no_rows(rule: StratumRule) -> str:
     return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
 
 
-TOLERANCE = 0.01  # relative: a share of the gradient this close to the natural one counts as equal
+TOLERANCE = 0.01  # relative difference up to which shares of rows and of the gradient are equal
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class SourceRows:
     part: float  # share of a batch that this source should fill
     candidates: pa.Table  # the rows of all sources, including those left out
     at: Ints  # positions of this source's rows in `candidates`
-    code: NDArray[np.int16]  # stratum
-    state_code: NDArray[np.int16]  # stratum that the row's state alone would give; -1: none
+    code: NDArray[np.int16]  # index of the row's stratum
+    state_code: NDArray[np.int16]  # index of the stratum by the row's state alone; -1: none
     episode: Codes
-    logged: Bools  # (E,) episodes of this source's recordings with admitted rows
+    logged: Bools  # (E,) episodes of this source in recordings with admitted rows
     admitted: Ints  # (S,) rows of each stratum, including those beyond a cap
 
 
@@ -76,12 +76,12 @@ class SourcePlan:
     outcome: F32 | None  # (kept, S) P(stratum | state, action); None if not estimated
     fit: RatioFit | None
     lines: list[Stratum]
-    warnings: tuple[str, ...]  # of strata with a wanted share but no rows
+    warnings: tuple[str, ...]  # warnings about strata with a wanted share but no rows
     found: dict[str, F64]  # stratum that lacks rows -> its rows by episode (E,); NaN: not `logged`
 
     @property
     def drawn(self) -> float:
-        """Return the fraction of its part of a batch that the source can fill."""
+        """Return the fraction that the source can fill of its part of a batch."""
         return self.shares.scale
 
 
@@ -95,7 +95,7 @@ def plan_source(
 ) -> SourcePlan:
     """Plan the shares, weights and report lines of one source.
 
-    `natural` (S,) are the shares that its rows represent; None: their own. `unknown` maps
+    `natural` (S,) are the natural shares that its rows represent; None: their own. `unknown` maps
     conditions that are unknown in all its rows to the reason.
 
     Raises:
@@ -140,7 +140,7 @@ def plan_source(
     )
     after = effective_shares(code, weight, shares.got)
     missing = missing_rows(mixture, rows, shares.wanted, draws)
-    missing[[rule.name in unknown_strata for rule in rules]] = 0  # more drives would not add any
+    missing[[rule.name in unknown_strata for rule in rules]] = 0  # more drives would not help
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
     found: dict[str, F64] = {}
     for i in np.flatnonzero(missing).tolist():
@@ -174,11 +174,11 @@ def plan_source(
 
 
 def below_natural(line: Stratum) -> bool:
-    """Return whether weights took a stratum's share of the gradient below its share of the rows.
+    """Return whether weights took a stratum's share of the gradient below its natural share.
 
-    If its drawn share is already below its natural share, by quota or for lack of rows, the
-    gradient's share is compared with the drawn share, and only if the stratum has a correction.
-    `line` has shares of its source's rows.
+    If the drawn share is already below the natural share, by quota or for lack of rows, the share
+    of the gradient is compared with the drawn share, and only if the stratum has a correction.
+    Shares in `line` are shares of its source's rows.
     """
     least = (1.0 - TOLERANCE) * min(line.natural_share, line.share)
     weighted = line.correction != "none" or line.share >= (1.0 - TOLERANCE) * line.natural_share
@@ -216,9 +216,9 @@ def _outcomes(
     kept: Bools,
     natural: F64 | None,
 ) -> tuple[F32 | None, RatioFit | None]:
-    """Estimate P(k | s, a) of strata corrected by density ratio, (kept, S); None if there are none.
+    """Estimate P(k | s, a) for strata k with the correction "density_ratio", (kept, S).
 
-    Also returns the quality of the fit.
+    Also returns the quality of the fit. Both are None if there are no such strata.
     """
     code = source.code[kept]
     by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]

@@ -24,8 +24,8 @@ from restock.replay.mixture.mixture import (
 
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000
-NOVEL = "novel"  # the stratum of rows with `novel` true in `novelty`; it needs no `where`
-NOVEL_PRIORITY = 999  # after all conditions, before nominal
+NOVEL = "novel"  # stratum of rows that the view `novelty` calls `novel`; it needs no `where`
+NOVEL_PRIORITY = 999  # comes after all conditions, and before nominal
 WHERE_PRIORITY = 50
 
 
@@ -42,13 +42,13 @@ class Stratum(msgspec.Struct, frozen=True):
     natural_share: float  # share of its source's rows
     wanted_share: float  # share of a batch's logged rows, like `share` and `effective_share`
     share: float  # actual share; a panel's shares sum to 1
-    replays_per_row: float  # expected over the mixture's planned draws
-    effective_episodes: float  # (sum n)^2 / sum n^2 over the rows per episode
+    replays_per_row: float  # expected draws of each row, over the mixture's planned draws
+    effective_episodes: float  # (sum n)^2 / sum n^2 over the numbers n of rows per episode
     effective_rows: float  # effective sample size of its rows under their weights
     largest_weight: float
     effective_share: float  # share of the gradient, after weights
     note: str
-    missing_rows: int = 0  # more rows that the wanted share needs
+    missing_rows: int = 0  # number of rows that the wanted share needs in addition
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ResolvedStratum:
 
     rule: StratumRule
     predicate: str  # SQL over `transitions`: whether a row may be in the stratum
-    # SQL that uses only the row's state, if it differs from `predicate`; else None.
+    # SQL of the state alone: whether it may be in the stratum. None: the same as `predicate`.
     state_predicate: str | None
     priority: int
     timing: Literal["pre", "post"]
@@ -70,22 +70,22 @@ class ResolvedStratum:
 
     @property
     def left_over(self) -> bool:
-        """Return whether this is nominal by episode: all episodes that no other stratum takes."""
+        """Return whether this stratum takes all episodes that no other stratum takes."""
         return self.rule.unit == "episode" and self.name == NOMINAL and self.rule.where is None
 
     @property
     def steps_of_episode(self) -> bool:
-        """Return whether it takes whole episodes, if the predicate holds in `min_steps` rows."""
+        """Return whether it takes whole episodes in which `min_steps` rows fulfil the predicate."""
         return self.rule.unit == "episode" and not self.left_over
 
     @property
     def dealt(self) -> bool:
-        """Return whether `deal_episodes` assigns its episodes: not if `priority` is set."""
+        """Return whether `deal_episodes` assigns its episodes, as its rule sets no `priority`."""
         return self.steps_of_episode and self.rule.priority is None
 
 
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
-    """Resolve the mixture's strata in their order, then those of `each_condition` by priority.
+    """Resolve the mixture's listed strata in order, then those of `each_condition` by priority.
 
     `conditions` are the store's conditions and exposures.
 
@@ -110,7 +110,7 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
 
 
 def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
-    """Return the rules of strata by name: those listed in the mixture, else `each_condition`."""
+    """Return the rule of each named stratum: from [[strata]], or else from [each_condition]."""
     listed = {rule.name: rule for rule in mixture.strata}
     each = mixture.each_condition or EachCondition()
     return [listed.get(name) or _rule_for(name, each) for name in names]
@@ -128,7 +128,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         predicate, priority, timing = rule.where, WHERE_PRIORITY, "post"
     elif rule.name == NOMINAL:
         predicate, priority, timing = "len(conditions) = 0", NOMINAL_PRIORITY, "pre"
-        # An outcome such as a slip without any condition before it happened in a nominal state.
+        # If an outcome such as a slip has no condition with timing "pre", its state was nominal.
         states = (c for c in of_kind(known.values(), "outcome") if c.timing == "pre")
         before = ", ".join(f"'{c.name}'" for c in states)
         state_predicate = f"NOT list_has_any(conditions, [{before}]::VARCHAR[])"
@@ -148,7 +148,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             " `where`; or add it to the profile and run `restock store label`",
         )
     if rule.unit == "episode":
-        # Selected by what the whole episode met, not by the outcome of this step.
+        # The whole episode selects a row, not the outcome of its step: no bias as for "post".
         state_predicate, timing = None, "pre"
         rest = rule.name == NOMINAL and rule.where is None
         predicate = "true" if rest else predicate
@@ -169,8 +169,7 @@ def required_steps(rule: StratumRule, steps: Ints) -> int:
     """Return the number of rows in which an episode must meet the condition.
 
     `steps` (E,) is the number of rows in which each episode met it. The result is `min_steps`, or
-    the largest number in `steps` if no episode has so many: a condition that occurs at all then
-    gets rows.
+    the largest number in `steps` if that is less, so that a condition that occurs gets rows.
     """
     return max(min(rule.min_steps, int(steps.max(initial=0))), 1)
 
@@ -178,16 +177,16 @@ def required_steps(rule: StratumRule, steps: Ints) -> int:
 def assign(
     member: Bools, strata: Sequence[ResolvedStratum], *, only_pre: bool = False
 ) -> NDArray[np.int16]:
-    """Return the stratum of each row (N,) from its memberships (N, S); -1 if it has none.
+    """Return the index of each row's stratum (N,); -1 for rows that may be in no stratum.
 
-    `only_pre` ignores strata selected by outcome. If `member` is by state alone, the result is
-    then the stratum that a row's state alone would give.
+    `member` (N, S) tells which strata a row may be in. `only_pre` ignores strata selected by
+    outcome: if `member` is by state alone, the result is the stratum by the row's state alone.
     """
     order = sorted(range(len(strata)), key=lambda index: (strata[index].priority, index))
     if only_pre:
         order = [index for index in order if strata[index].timing == "pre"]
     code = np.full(len(member), NO_STRATUM, np.int16)
-    for index in reversed(order):  # the stratum with the lowest priority number is written last
+    for index in reversed(order):  # the lowest priority number comes last and overwrites others
         code[member[:, index]] = index
     return code
 
@@ -199,16 +198,16 @@ def deal_episodes(
     strata: Sequence[ResolvedStratum],
     counted: Bools,
 ) -> NDArray[np.int16]:
-    """Return the rarest stratum of each episode (E,); -1 if no stratum gets the episode.
+    """Deal episodes to strata; return the stratum of each (E,), -1 if no stratum gets it.
 
     In turn, the stratum with the fewest rows so far takes one of its episodes, beginning with those
     that fit the fewest strata. So a condition that few episodes met gets all of them, and a
     condition that always accompanies another (a recovery follows each near collision) gets some.
 
     Args:
-        code: (N,) the stratum by `assign`; only rows with a dealt stratum take part.
+        code: (N,) each row's stratum by `assign`; only rows with a dealt stratum take part.
         member: (N, S) strata that a row may be in; the same for all rows of an episode.
-        episode: (N,) code of its episode in 0..E - 1, in order of appearance.
+        episode: (N,) code of the row's episode in 0..E - 1, in order of appearance.
         counted: (N,) rows that may be drawn; other rows do not count for a stratum's size.
     """
     given = np.full(int(episode.max(initial=-1)) + 1, NO_STRATUM, np.int16)
@@ -223,7 +222,7 @@ def deal_episodes(
     first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[episode_of_row]
     allowed = member[rows[first]][:, dealt]  # (n episodes, K)
     size = np.bincount(place, weights=counted[rows]).astype(np.int64)
-    # Ties go to the stratum that could get the fewest rows, then by priority.
+    # If strata have equally many rows, the one that could get the fewest is next, then by priority.
     available = (allowed * size[:, None]).sum(axis=0)
     filled = [(0, int(available[k]), strata[dealt[k]].priority, k) for k in range(len(dealt))]
     heapq.heapify(filled)
@@ -250,7 +249,7 @@ def replace_dealt(
     episode: Codes,
     strata: Sequence[ResolvedStratum],
 ) -> NDArray[np.int16]:
-    """Return strata (N,) by priority, with dealt strata replaced by those of `deal_episodes`."""
+    """Return `code` (N,) with dealt strata replaced by `given`, the result of `deal_episodes`."""
     dealt = [index for index, stratum in enumerate(strata) if stratum.dealt]
     of_episode = given[episode]
     return np.where(np.isin(code, dealt) & (of_episode != NO_STRATUM), of_episode, code)

@@ -39,8 +39,8 @@ from restock.replay.plan.candidates import any_order, matrix, stored_view
 
 BATCH_ROWS = 4_096  # observations in memory at a time
 COLUMNS = 16  # features in memory at a time
-FIT_ROWS = 20_000  # largest number of rows of each outcome to fit, chosen by id
-PENALTY = 1e-3  # L2, on standardised features
+FIT_ROWS = 20_000  # largest number of rows per outcome that the model is fitted to, chosen by id
+PENALTY = 1e-3  # L2 penalty on the weights of standardised features
 
 
 class Corrected(Protocol):
@@ -58,12 +58,12 @@ class RowWeights:
 
     Args:
         code: (N,) each row's stratum, never -1.
-        state_code: (N,) the stratum that its state alone would give, -1 for none.
+        state_code: (N,) each row's stratum by its state alone, -1 for none.
         strata: (S,) timing and correction of each stratum.
         outcome: (N, S) the probability of each "density_ratio" stratum given a row's state and
             action (0 for the other strata), or None.
         natural: (S,) natural share of each stratum, if the rows are a selection (an archive, a
-            cap); None: in proportion to its rows.
+            cap); None: in proportion to the stratum's rows.
     """
 
     def __init__(
@@ -79,12 +79,12 @@ class RowWeights:
         self.strata, self.rule, self.outcome = list(strata), rule, outcome
         self.rows = np.bincount(code, minlength=size)
         self._occurs = self.rows if natural is None else np.where(self.rows > 0, natural, 0.0)
-        # State code -1 becomes the last column.
+        # Cells of the table `_table`; state code -1 (none) is its last column.
         self._cell = code.astype(np.int32) * (size + 1) + state_code % (size + 1)
         self._in_cell = np.bincount(self._cell, minlength=size * (size + 1)).reshape(size, size + 1)
 
     def boost(self, shares: F64) -> F64:
-        """Return drawn share over natural share of each stratum, (S,); 1 if it is empty."""
+        """Return each stratum's drawn share over its natural share, (S,); 1 if it has no rows."""
         ones = np.ones(len(shares))
         drawn = shares * self._occurs.sum()
         return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
@@ -105,12 +105,12 @@ class RowWeights:
         return np.asarray(weight / max(float(total), 1e-12), np.float32)
 
     def _table(self, boost: F64) -> tuple[F64, F64]:
-        """Return weights by stratum and state's stratum (S, S + 1), and target densities (S + 1,).
+        """Return weights by row's and state's stratum (S, S + 1), and target densities (S + 1,).
 
-        Target densities are of states, as multiples of their natural density.
+        A target density is that of states in a stratum, as a multiple of their natural density.
         """
         corrected = np.array([stratum.correction != "none" for stratum in self.strata])
-        # Target density of a state: boosted if its stratum has no correction, else natural.
+        # States stay boosted if their stratum has no correction; else their density is natural.
         aim = np.where(corrected | (boost == 0), 1.0, boost)
         state_aim = np.append(aim, 1.0)
         table = np.ones((len(self.strata), len(self.strata) + 1))
@@ -140,7 +140,7 @@ def importance_weights(
 
 
 def rows_represented(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
-    """Return how many rows of a natural sample each row represents, (N,), with mean 1."""
+    """Return how many rows of an unselected sample each row represents, (N,), with mean 1."""
     if natural is None:
         return np.ones(len(code))
     rows = np.bincount(code, minlength=size)
@@ -166,12 +166,12 @@ class WeightsInForce:
     """The weights of a panel's rows under shares that change during a run.
 
     Args:
-        code: (n,) the stratum of each row over all sources; those of source k begin at k * S.
-        state_code: (n,) the stratum that its state alone would give, within its source.
+        code: (n,) each row's stratum in 0..K * S - 1; strata of source k begin at k * S.
+        state_code: (n,) each row's stratum by its state alone, in 0..S - 1; -1 for none.
         strata: (K * S,) timing and correction of each stratum.
         sources: K, the number of stores of the panel.
         outcome: (n, S) as in `RowWeights`, or None.
-        natural: for each source (S,) as in `RowWeights`, or None; (): None for all.
+        natural: for each source, (S,) or None as in `RowWeights`; (): None for all.
     """
 
     def __init__(
@@ -204,28 +204,28 @@ class WeightsInForce:
                 self._weight[at] = weights.compute(shares[span] / total)
 
     def of(self, rows: NDArray[Any]) -> F32:
-        """Return the weights (n,) of rows (n,) under the last `set_shares`."""
+        """Return the weights (n,) of rows (n,) under the shares of the last `set_shares`."""
         weight: F32 = self._weight[rows]
         return weight
 
 
 @dataclass(frozen=True)
 class RatioFit:
-    """How well states and actions predict outcomes. Losses are of rows held out from the fit."""
+    """How well states and actions predict outcomes. Losses are on rows held out from the fit."""
 
     source: str
     strata: tuple[str, ...]
-    rows: int  # rows fitted
+    rows: int  # number of rows that the model was fitted to
     log_loss: float  # nats per row
-    base_log_loss: float  # of a prediction by the frequencies of outcomes alone
+    base_log_loss: float  # loss if the frequencies of outcomes alone are the prediction
 
 
 def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
-    """Return r(s, a) of each row (N,), relative to its state's target density, at most `clip`.
+    """Return the ratio of drawn to target density of each row's (s, a), (N,), at most `clip`.
 
-    `outcome` (N, S) is P(k | s, a) of the estimated strata, and 0 for others. `boost` (S,) is the
-    drawn share over the natural share of each stratum. `state_aim` (N,) is the target density of
-    each row's state, at which rows of other outcomes are drawn.
+    `outcome` (N, S) is P(k | s, a) of the estimated strata k, and 0 for others. `boost` (S,) is
+    each stratum's drawn share over its natural share. `state_aim` (N,) is the target density of
+    each row's state; rows of other outcomes are drawn at this density.
     """
     drawn = outcome @ boost + (1.0 - outcome.sum(axis=1)) * state_aim
     ratio = np.divide(drawn, state_aim, out=np.ones(len(drawn)), where=state_aim > 0)
@@ -283,7 +283,7 @@ class OutcomeModel:
         scaled = design[:, 1:]
         np.subtract(features, self.mean, out=scaled)
         scaled /= self.scale
-        # Clipped so that observations unlike those fitted do not give certain predictions.
+        # Clip features: observations unlike those of the fit must not give certain predictions.
         np.clip(scaled, -5.0, 5.0, out=scaled)
         return design
 
@@ -291,8 +291,8 @@ class OutcomeModel:
 def _moments(features: NDArray[Any], weight: F64) -> tuple[F64, F64]:
     """Compute the weighted mean and standard deviation of each column, (D,) each.
 
-    It works on a few columns at a time: a float64 copy of all would need more memory than anything
-    else in a panel.
+    A few columns are converted to float64 at a time: a copy of all columns would need more memory
+    than anything else in building a panel.
     """
     mean, spread = np.zeros(features.shape[1]), np.zeros(features.shape[1])
     for begin in range(0, len(mean), COLUMNS):
@@ -309,10 +309,10 @@ class RatioRows:
 
     transition_id: Ints
     action: Ints
-    state_code: NDArray[np.int16]  # stratum that the state alone would give, -1 for none
-    code: NDArray[np.int16]  # stratum
-    order: NDArray[np.uint64]  # hashes of ids, by which rows for the fit are chosen
-    rows_represented: F64  # how many rows of a natural sample each row represents
+    state_code: NDArray[np.int16]  # index of the stratum by the row's state alone, -1 for none
+    code: NDArray[np.int16]  # index of the row's stratum
+    order: NDArray[np.uint64]  # hashes of ids; the rows to fit are those with the smallest
+    rows_represented: F64  # see the function `rows_represented`
 
 
 def estimate_outcomes(
@@ -324,7 +324,7 @@ def estimate_outcomes(
 ) -> tuple[F32, RatioFit]:
     """Estimate P(k | s, a) (n, K) for the strata `estimated` (K,); also return the fit's quality.
 
-    The features are the observation, the action, and the stratum that the state alone would give.
+    Features are the observation, the action, and the stratum by the state alone.
     """
     label = np.zeros(len(rows.code), np.int64)
     for place, stratum in enumerate(estimated.tolist(), start=1):
@@ -346,7 +346,7 @@ def estimate_outcomes(
     held_out = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to validate the fit
     if held_out.all() or not held_out.any():
         held_out = np.zeros(len(chosen), np.bool_)
-    last = np.argsort(held_out, kind="stable")  # rows held out last, so that both parts are views
+    last = np.argsort(held_out, kind="stable")  # held-out rows last: both parts are slices
     chosen, weight = chosen[last], weight[last]
     split = len(chosen) - int(held_out.sum())
     x, y = np.empty((len(chosen), 0), np.float32), label[chosen]
@@ -354,7 +354,7 @@ def estimate_outcomes(
     for observation, at in _observations(connection, rows.transition_id, chosen):
         made = features(observation, at)
         if not x.shape[1]:
-            x = np.zeros((len(chosen), made.shape[1]), np.float32)  # exact: stored as float32
+            x = np.zeros((len(chosen), made.shape[1]), np.float32)  # exact: the store has float32
         x[[place_of[int(row)] for row in at]] = made
     model = OutcomeModel(x[:split], y[:split], len(estimated) + 1, weight[:split])
     validation = slice(split if split < len(x) else 0, None)
@@ -389,7 +389,7 @@ def _observations(
     wanted = ids[at][order]
     query = f"SELECT transition_id, observation FROM {stored_view(connection)}"
     with any_order(connection):
-        # Matched here instead of in a join, which would keep rows in memory.
+        # Match ids in Python: a join in DuckDB would keep rows in memory.
         for batch in connection.sql(query).to_arrow_reader(BATCH_ROWS):
             these = batch.column("transition_id").to_numpy()
             place = np.minimum(np.searchsorted(wanted, these), len(wanted) - 1)
@@ -397,6 +397,6 @@ def _observations(
             if not len(found):
                 continue
             column = batch.column("observation")
-            if len(found) < len(column):  # other rows may belong to a task with another size
+            if len(found) < len(column):  # rows of other tasks may have another size: drop them
                 column = column.take(pa.array(found))
             yield matrix(column, len(column[0])), at[order[place[found]]]
