@@ -1,1 +1,1 @@
-"""The MuJoCo twin of a warehouse robot; it knows no learner."""
+"""The MuJoCo twin of a warehouse robot, independent of any learner."""

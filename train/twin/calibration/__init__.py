@@ -1,1 +1,1 @@
-"""The twin fitted to logs, and how far it is from them."""
+"""Fits of the twin to logs, and measurements of the gap between twin and logs."""

@@ -104,7 +104,7 @@ class _FitData:
 
     steps: LoggedSteps
     recordings: tuple[str, ...]  # IDs of the recordings that have segments
-    segments: LoggedSegments  # to fit
+    segments: LoggedSegments  # the segments to fit
     held_out_from_ns: dict[str, int]  # recording -> time from which it is held out
     left_out: dict[str, int]  # reason -> number of segments or steps left out
 

@@ -158,7 +158,7 @@ def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
 RESAMPLES = 1000
 FEW_CLUSTERS = 8
 PROFILE_POINTS = 12
-CHI_SQUARE_95 = 3.84  # with one degree of freedom
+CHI_SQUARE_95 = 3.84  # 95 % point of chi-square with one degree of freedom
 SLIDES_MPS = 0.05  # a wheel slides if it is faster than this over the floor
 CONFOUNDED = 0.95  # warn if two estimates have at least this correlation
 
@@ -168,7 +168,7 @@ class Uncertainty:
     """Uncertainty of n parameters, in coordinates of the unit cube."""
 
     half: F64  # (n,) half widths of the 95 % intervals
-    correlation: F64  # (n, n) of the estimates
+    correlation: F64  # (n, n) correlations between the estimates
     clusters: int  # number of episodes, or of segments if there are few episodes
 
 

@@ -269,7 +269,7 @@ def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
         nowhere = np.full(count, -1, np.int64)
         return PlanMemory(steps.task, Routing.none(count), nowhere, 0.0)
     now, after = steps.now["route_remaining_m"], steps.after["route_remaining_m"]
-    kept = np.abs(now - steps.progress_m - after) < SAME_M  # the same plan at t + 1
+    kept = np.abs(now - steps.progress_m - after) < SAME_M  # plan is the same at t + 1
     starts = steps.begins | ~np.append(False, kept[:-1])
     plan = np.cumsum(starts) - 1
     first = np.append(np.flatnonzero(starts), count)

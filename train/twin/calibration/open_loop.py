@@ -60,7 +60,7 @@ class LoggedSegments:
     """
 
     task: Task
-    robot: RobotModel | None  # of the log's profile; None: the twin's stand-in
+    robot: RobotModel | None  # robot of the log's profile; None: the twin's stand-in
     horizon_steps: int  # K
     warmup_steps: int  # W
     row: Ints  # (S,) index of the first of the K steps in the `LoggedSteps`
@@ -301,7 +301,7 @@ class OpenLoopResult:
 
     signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
     sliding_mps: F64  # (P, S, K + 1) sliding speed along the robot, of the wheel that slides faster
-    bumped: Bools  # (P, S) in the last period
+    bumped: Bools  # (P, S) the bumper was pressed in the last period
     sector_clearance_m: F64  # (P, S, sectors) at the end; (P, S, 0) on an empty floor
     diverged: Bools  # (P, S) the physics diverged, so the other values are meaningless
 

@@ -234,7 +234,7 @@ class Navigation(Stateful):
                 signals[name][ids] = column
 
     def propose(self, signals: Signals) -> None:
-        """Add navigation's next command to the signals; NaN if it proposes none."""
+        """Add navigation's next command to the signals; NaN if navigation proposes none."""
         command: F64 = np.full((len(signals["stamp_ns"]), 2), np.nan)
         if self._follower is not None:
             command = self._follower.table[self._follower.choose(signals)]

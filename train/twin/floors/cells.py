@@ -19,7 +19,7 @@ from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 Cells = Bools  # (X, Y)
 Box = tuple[int, int, int, int]  # first and last column, first and last row; lasts are exclusive
 
-WIDTH_M = (0.7, 2.6)  # of a corridor
+WIDTH_M = (0.7, 2.6)  # minimum and maximum width of a corridor
 LENGTH_M = 1.8  # minimum length of a corridor: a pallet, and room before and behind it
 EDGE_M = 0.15  # how far a corridor's side may wander: a map's racks are not straight
 CROSSING_M = 2.0  # maximum length of a crossing beyond the end of an aisle segment

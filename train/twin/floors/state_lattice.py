@@ -42,8 +42,8 @@ class Motion:
 
     outline_m: F64  # (K, 2) points on its outline, x ahead of the pose
     ahead_mps: float
-    back_mps: float  # 0: it does not drive backwards
-    turn_radps: float  # on the spot
+    back_mps: float  # 0 if the robot does not drive backwards
+    turn_radps: float  # yaw rate of a turn on the spot
 
 
 @cache

@@ -52,7 +52,7 @@ class Mission:
     is_true: Callable[[Situation], Bools] | None = None  # None: no obstacle is staged
     blocks: Mapping[str, str] = field(default_factory=dict)  # way to stage it -> colour in charts
     block_measures: Mapping[str, str] = field(default_factory=dict)  # measure of a study -> block
-    needs_lidar: bool = False  # a robot without a lidar meets it only by driving into it
+    needs_lidar: bool = False  # without a lidar, a robot notices the obstacle only by hitting it
 
 
 def length_m(plan: F64) -> float:

@@ -67,10 +67,10 @@ class Handles:
     wheel_qvel: tuple[int, ...]  # the wheels' speeds
     steering_qpos: tuple[int, ...]  # the angles of steered front wheels, left and right
     building: slice  # the geoms of racks and walls
-    pallets: slice  # in the mocap bodies
+    pallets: slice  # the mocap bodies of pallets
     people: slice
     forklifts: slice
-    accelerometer: slice  # in sensordata
+    accelerometer: slice  # the accelerometer's values in sensordata
     bumper: int
 
 

@@ -54,7 +54,7 @@ class Perturbation(Checked, frozen=True):
     gyro_bias_radps: Annotated[float, Meta(ge=-0.5, le=0.5)] = 0.0
     accel_noise_mps2: UpToTwo = 0.05
     accel_bias_mps2: Annotated[float, Meta(ge=-2, le=2)] = 0.0
-    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one per vector environment
+    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one for a vector environment
 
     def changed(self) -> dict[str, float]:
         """Return the values that are not nominal; they are stored with every transition."""

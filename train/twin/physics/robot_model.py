@@ -53,7 +53,7 @@ class FloorFriction:
         self._written, self._geoms, self._wheels_m = geom_friction, wheel_geoms, wheels_m
         count = len(geom_friction)
         self.patches = np.tile(NO_PATCH, (count, PATCHES, 1)).astype(np.float64)
-        self.base = np.full(count, FLOOR_FRICTION)  # of the floor outside patches
+        self.base = np.full(count, FLOOR_FRICTION)  # friction of the floor outside patches
         self.scale = np.ones((count, len(wheels_m)))  # factor under each wheel
         self.icy: Ints = np.zeros(0, np.int64)  # the environments that have patches
 
@@ -98,7 +98,7 @@ def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
     return friction
 
 
-WHEEL_RADIUS_M = 0.10  # of the stand-in, like all constants up to REST_Z_M
+WHEEL_RADIUS_M = 0.10  # the stand-in's radius; all constants up to REST_Z_M are the stand-in's
 TRACK_M = 0.44  # distance between the wheels' contact points
 CASTER_RADIUS_M = 0.04
 CASTER_X_M = 0.27
@@ -131,22 +131,22 @@ class RobotModel:
 
     length_m: float
     width_m: float
-    axle_x_m: float  # of the axle, ahead of the outline's middle
+    axle_x_m: float  # position of the axle ahead of the outline's middle
     wheel_radius_m: float  # rolling radius, which odometry uses too
-    contact_radius_m: float  # of the wheels' spheres, which sink into the floor a little
-    track_m: float  # between the wheels' contact points
+    contact_radius_m: float  # radius of the wheels' spheres, which sink into the floor a little
+    track_m: float  # distance between the wheels' contact points
     turn_track_m: float  # effective track, from which controller and odometry compute turns
-    wheelbase_m: float  # between two axles; 0 if there is one
+    wheelbase_m: float  # distance between two axles; 0 if there is one
     wheel_kg: float
     chassis_kg: float
     chassis_height_m: float
-    chassis_z_m: float  # of the chassis' middle
+    chassis_z_m: float  # height of the chassis' middle
     ballast: bool  # the chassis' mass is in its lower half
     casters_m: tuple[tuple[float, float], ...]
     caster_radius_m: float
     caster_kg: float
     lidar_z_m: float
-    bearings_rad: tuple[float, ...]  # of the beams, in the lidar's own frame
+    bearings_rad: tuple[float, ...]  # bearings of the beams in the lidar's own frame
     motor_kv: float
     motor_limit_nm: float
     armature: float
@@ -169,12 +169,12 @@ class RobotModel:
 
     @property
     def steers(self) -> bool:
-        """Return whether its front wheels steer, so that only the rear ones are driven."""
+        """Return whether the front wheels steer; then only the rear wheels are driven."""
         return self.drive == "ackermann"
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Return the radius of its tightest circle, in metres; 0 if it turns on the spot."""
+        """Return the radius of the tightest circle, in metres; 0 if the robot turns on the spot."""
         return self.wheelbase_m / math.tan(self.max_steering_rad) if self.steers else 0.0
 
     @property
@@ -260,7 +260,7 @@ def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
 
 
 def design(robot: Robot, body: Body) -> RobotModel:
-    """Design a profile's robot; it is not yet tried in the physics.
+    """Design a profile's robot from its dimensions, without trying it in the physics.
 
     Raises:
         ConfigError: its parts do not fit together.
@@ -352,7 +352,7 @@ def measures(robot: Robot, body: Body) -> Measures:
 
 
 def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
-    """Return the beams' bearings, from end to end; of a full turn, the last is one step short."""
+    """Return evenly spaced bearings of beams, both ends included; a full turn omits its end."""
     span = lidar.angle_max_rad - lidar.angle_min_rad
     around = span > 2 * math.pi * (1 - 0.5 / beams)
     step = span / beams if around else span / (beams - 1)

@@ -26,7 +26,7 @@ _log = mujoco.MjLogConfig.get()
 _log.logto_file = False
 _log.set()
 
-CASTER_LIFT_M = 0.001  # so that the driven wheels carry most of the load
+CASTER_LIFT_M = 0.001  # casters hang this high, so that driven wheels carry most of the load
 STEERING_RADPS = 50.0  # the natural frequency of a steering motor with its wheel
 
 

@@ -40,7 +40,7 @@ from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import MOVING_HALF_M, Handles, building_boxes
 from restock.train.twin.physics.robot_model import OBSTACLE_GROUP
 
-FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for a forklift in gaps to robots
+FORKLIFT_RADIUS_M = 0.5  # radius of the circle that stands for a forklift when gaps are computed
 YIELD_M = 0.5  # gap at which an attentive agent stops
 STANDING_M = 0.15  # gap at which an inattentive agent stops, unless the robot drives at it
 RETREAT_M = 2.0  # distance from the robot at which a retreat ends
@@ -333,7 +333,7 @@ class Lidar:
         standing = [self._cut_boxes(*boxes) for boxes in scenery.buildings]
         self._first = np.cumsum([0, *(len(boxes) for boxes in standing)])
         self._standing = np.concatenate(standing)
-        self._half_m = MOVING_HALF_M[:, :2].copy()  # of pallets, people and forklifts
+        self._half_m = MOVING_HALF_M[:, :2].copy()  # half sizes of pallets, people, forklifts
         self._half_m[scenery.handles.people, 1] = 0.0  # marks a cylinder
 
     def _cut_boxes(self, middle: F64, half: F64) -> F64:

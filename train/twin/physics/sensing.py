@@ -67,7 +67,7 @@ class Sensing(Stateful):
         self._generators = [np.random.default_rng(0)] * num
         self._drift = np.zeros((num, 2))  # drift of localised x and y at the last drawn step
         self._scale = np.zeros((num, _SCALARS))
-        self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
+        self._bias = np.zeros((num, 3))  # biases of wheels' speed, gyroscope, accelerometer
         self._scan_every = np.ones(num, np.int64)  # steps from scan to scan
         self._pose_every = np.ones(num, np.int64)
         self.pose = np.zeros((num, 3))  # last localised pose
@@ -197,7 +197,7 @@ class Sensing(Stateful):
         self._track(ids, signals)
 
     def _track(self, ids: Ints, signals: Signals, *, begin: bool = False) -> None:
-        """Add tracks to the signals of robots `ids`, which are all robots unless they `begin`."""
+        """Add tracks to signals of robots `ids`: robots that `begin` an episode, or else all."""
         if self.tracker is None:
             return
         scan_m = self._fine.scan(self.ranges_m[ids], self.task.range_min_m)

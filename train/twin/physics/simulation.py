@@ -144,7 +144,7 @@ class SteeringController(BaseController):
     ) -> None:
         super().__init__(num_envs, robot, period_s, timestep_s, substeps)
         self._accel_limit = np.array([robot.accel_limit[0], robot.steering_rate_radps])
-        self.steering_rad = np.zeros(num_envs)  # of a virtual wheel, midway on the front axle
+        self.steering_rad = np.zeros(num_envs)  # angle of a virtual wheel, midway on the front axle
 
     def reset(self, env: int) -> None:
         """Reset to a standstill with the wheels straight ahead."""
@@ -267,12 +267,12 @@ class BodyState:
     x_m: F64
     y_m: F64
     yaw_rad: F64
-    speed_mps: F64  # (N,) over ground, forward
+    speed_mps: F64  # (N,) forward speed over ground
     yaw_rate_radps: F64
     wheel_angle_rad: F64  # (N, 2) left, right
     wheel_speed_radps: F64  # (N, 2)
-    accel_mps2: F64  # (N, 3) of the accelerometer, mean since the previous call
-    bumped: Bools  # (N,) at any substep since the previous call
+    accel_mps2: F64  # (N, 3) mean reading of the accelerometer since the previous call
+    bumped: Bools  # (N,) the bumper was pressed since the previous call
 
 
 class Simulation(Stateful):
@@ -281,7 +281,7 @@ class Simulation(Stateful):
     Before a state is restored, every environment must be reset to the episode of that state.
     """
 
-    # The scenery is restored after the physics, because it reads positions from there.
+    # The scenery is restored after the physics, because it reads positions from the physics.
     STATE = (
         "time_s",
         "bumped",
@@ -345,10 +345,10 @@ class Simulation(Stateful):
             num_envs, robot, task.control_period_s, timestep_s, self.substeps
         )
         self.time_s = np.zeros(num_envs)
-        self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
+        self.bumped = np.zeros(num_envs, np.bool_)  # bumper was pressed in the last control period
         self.accel = np.zeros((num_envs, 3))  # mean over the second half of the last block
-        self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
-        self.travelled_m = np.zeros(num_envs)  # in the last control period, over ground
+        self.slipped = np.zeros(num_envs, np.bool_)  # a wheel slid on a patch in the last period
+        self.travelled_m = np.zeros(num_envs)  # distance over ground in the last control period
         self.diverged = np.zeros(num_envs, np.bool_)
         # At the start of the last control period: poses, gaps to traffic, robots on a patch.
         self.start, self.traffic_gap_m = np.zeros((num_envs, 3)), np.zeros((num_envs, AGENTS))

@@ -117,11 +117,11 @@ class OrderedMissions:
         self._rng = np.random.Generator(np.random.PCG64([seed, zlib.crc32(as_toml(file).encode())]))
         self._drivers = _deal(FLEET, self._rng)
         self._driver, self._version = driver, version
-        self.driven: Counter[int] = Counter()  # by order
+        self.driven: Counter[int] = Counter()  # missions driven so far, by order
         self.observed: Counter[int] = Counter()
 
     def rounds(self) -> Iterator[Iterator[Mission]]:
-        """Yield rounds. Before the next one, drive all missions of a round and `note` them."""
+        """Yield rounds; drive and `note` all missions of a round before taking the next round."""
         while owed := self.owed():
             numbers = np.repeat(list(owed), list(owed.values()))
             yield iter([self._mission(int(number)) for number in self._rng.permutation(numbers)])
@@ -339,7 +339,7 @@ class DrivenMission:
     action: Ints  # (T,)
     reward: F32  # (T,)
     success: bool
-    terminated: bool  # at its last step; False: truncated
+    terminated: bool  # the last step was terminal; False: truncated
     floor: Warehouse
 
 
@@ -403,14 +403,14 @@ class Fleet:
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
         self._logs: list[_Log | None] = [None] * robots
-        self._motion: list[BodyState] = []  # of the current step
+        self._motion: list[BodyState] = []  # states during the current step
         self._scan: F64 | None = None  # true ranges half-way through the current step
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
 
     def drive(
         self, missions: Iterator[Mission], policies: BehaviourPolicies
     ) -> Iterator[DrivenMission]:
-        """Drive missions and yield them in their order, until they or the caller stop."""
+        """Drive missions and yield them in their order, until none is left or the caller stops."""
         env, numbered = self.env, enumerate(missions)
         finished: dict[int, DrivenMission] = {}
         delivered = 0
@@ -445,7 +445,7 @@ class Fleet:
         missions: Iterator[tuple[int, Mission]],
         policies: BehaviourPolicies,
     ) -> None:
-        """Give each of these robots its next mission; without one, it drives on unrecorded."""
+        """Give each of these robots its next mission; without one, a robot drives on unrecorded."""
         env = self.env
         entries = [next(missions, None) for _ in robots]
         idle = EpisodeSpec("nominal", 0)
@@ -550,7 +550,7 @@ class Fleet:
 
 
 def _motion_of(states: list[BodyState], robot: int) -> Motion:
-    """Return one robot's motion out of all robots'."""
+    """Extract one robot's motion from the states of all robots."""
     pose = np.array(
         [(state.x_m[robot], state.y_m[robot], state.yaw_rad[robot]) for state in states]
     )

@@ -32,8 +32,8 @@ from restock.train.twin.recording.robot_topics import Drive, Lidar, Odometer
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
 LIDAR_LSB_M = 2.0**-9  # about 2 mm
-PLANNING_S = (0.005, 0.007)  # from a tick to the navigation stack's proposal
-THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any other topic's delay
+PLANNING_S = (0.005, 0.007)  # delay from a tick to the navigation stack's proposal
+THINKING_S = (0.012, 0.016)  # delay from a tick to its command; longer than any other topic's
 BUMPER_POLL_S = 0.02
 JITTER_S = 4e-4  # maximum jitter of a sensor's timer, early or late
 TICK_TOLERANCE_S = 1e-6
@@ -87,7 +87,7 @@ class Rates(Checked, frozen=True):
     tf: Hertz = 20.0
     bumper: Hertz = 10.0
     diagnostics: Hertz = 1.0
-    plan: Hertz = 1.0  # and whenever it changes
+    plan: Hertz = 1.0  # plans are also sent whenever they change
 
     def check(self) -> None:
         if self.scan not in (5, 10):
@@ -103,7 +103,7 @@ class Robot:
     rates: Rates
     odometer: Odometer
     driven_s: float = 0.0
-    _start_ns: int = 0  # of the current mission
+    _start_ns: int = 0  # start of the current mission
 
     def publish(self, drive: Drive, start_ns: int) -> list[Message]:
         """Return all messages of a mission that starts at `start_ns`, in order of log time."""

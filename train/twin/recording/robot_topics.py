@@ -114,7 +114,7 @@ class Drive:
 class Odometer:
     """Wheel odometry: the pose in `odom`, from the encoders alone."""
 
-    wheel_radius_m: float  # that the odometry assumes
+    wheel_radius_m: float  # radius that the odometry assumes
     track_m: float
     pose: F64 = field(default_factory=lambda: np.zeros(3))  # x, y, yaw as the mission starts
     wheel_angle_rad: F64 = field(default_factory=lambda: np.zeros(2))
@@ -475,7 +475,7 @@ def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) ->
 
 
 def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
-    """Return people and forklifts at (n, A, 3) places, one message per row."""
+    """Return markers of people and forklifts at places (n, A, 3), one message per row."""
     messages: list[bytes] = [b""] * len(places)
     shown = on_floor(places)
     for seen in {tuple(row) for row in shown.tolist()}:

@@ -209,7 +209,7 @@ class Evidence:
     footprint: Footprint | None = None
     scans: list[PlacedScans] = field(default_factory=list)  # once per clock
     notes: list[str] = field(default_factory=list)
-    others: Mapping[str, Drive] = field(default_factory=dict)  # of a store's other recordings
+    others: Mapping[str, Drive] = field(default_factory=dict)  # source -> drive of other recordings
 
 
 def gather(

@@ -455,7 +455,7 @@ def _trace(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> t
     """Return the log-odds (X, Y) that cells are occupied, and how many scans ended in each cell."""
     odds = np.zeros(shape)
     flat, ended = odds.reshape(-1), np.zeros(odds.size, np.int64)
-    passed, stopped = np.zeros((2, odds.size), np.bool_)  # of one scan
+    passed, stopped = np.zeros((2, odds.size), np.bool_)  # cells, for one scan
     for origin, hit in zip(origins, hits, strict=True):
         if not len(hit):
             continue

@@ -75,7 +75,7 @@ class Poses:
     y_m: F64
     yaw_rad: F64  # unwrapped; NaN if unknown
     frame: str
-    source: str  # for people
+    source: str  # description of the pose source, for people
 
     def __len__(self) -> int:
         return len(self.x_m)

@@ -62,7 +62,7 @@ class Surveyed:
     floor: Warehouse
     grid: OccupancyGrid  # the floor was made from this
     by: Source
-    source: str  # for people
+    source: str  # description of the source, for people
     footprint: Footprint
     poses: Poses | None = None
     notes: list[str] = field(default_factory=list)
@@ -124,7 +124,7 @@ def survey(
             "a recording can only be chosen from a store, and this is not one", where=str(path),
             remedy="leave it out, or give the store",
         )  # fmt: skip
-    choose_definitions(definitions)  # checks them before anything is read
+    choose_definitions(definitions)  # refuse invalid definitions before anything is read
     evidence = gather(
         path,
         stored_recording=recording,
