@@ -38,11 +38,11 @@ class ComparabilityLimits:
     """Limits within which two feeds count as the same."""
 
     distance: float = 0.02  # total variation distance between the mixes of the whole run
-    tenth_distance: float = 0.05  # the same of a tenth of the run, with a tenth of the episodes
-    share_ratio: float = 1.25  # of a condition's shares
-    share_floor: float = 0.0005  # no ratio is checked for a smaller share in both feeds
+    tenth_distance: float = 0.05  # the same for a tenth of the run, which has fewer episodes
+    share_ratio: float = 1.25  # ratio between the arms' shares of a condition
+    share_floor: float = 0.0005  # ratios of shares that are smaller in both feeds are not checked
     unlabelled: float = 0.5  # share of the fresh rows drawn before their episode had labels
-    episode_ratio: float = 1.5  # of the numbers of episodes that a condition was drawn from
+    episode_ratio: float = 1.5  # ratio between numbers of episodes that a condition was drawn from
     confidence: float = 0.95
     resamples: int = 1000
 
@@ -75,13 +75,13 @@ class Check:
     first: float | None  # the figure of each arm, if the check has one
     second: float | None
     value: float  # distance, or ratio of the larger to the smaller
-    low: float  # of its confidence interval
+    low: float  # lower end of the value's confidence interval
     high: float
     limit: float
 
     @classmethod
     def exact(cls, name: str, first: float, second: float, value: float, limit: float) -> Check:
-        """Make a check of figures of the whole run that are not random, so without an interval."""
+        """Make a check of exact figures of the whole run, which have no interval."""
         return cls(name, "whole run", first, second, value, value, value, limit)
 
     @property
@@ -100,7 +100,7 @@ def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Che
     """Run all checks. Both feeds must name the same cells in the same order."""
     checks = []
     totals = [_resampled(feed, rng) for feed in (first, second)]
-    # Without importance weights, both mixes are the same.
+    # Without importance weights, the mix after weights equals the mix before.
     weighted = any(not np.array_equal(feed.drawn, feed.weight) for feed in (first, second))
     for kind, name in enumerate(("mix", "mix after weights")[: 1 + weighted]):
         for tenth in (None, *range(10)):
@@ -113,7 +113,7 @@ def check_feeds(first: Feed, second: Feed, rng: np.random.Generator) -> list[Che
                 if any(fed):  # only one arm was fed in this tenth
                     checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
                 continue
-            with np.errstate(invalid="ignore"):  # a resample without rows is NaN: inconclusive
+            with np.errstate(invalid="ignore"):  # a resample without rows is NaN, so inconclusive
                 a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
             checks.append(_check_distance(name, part, a, b, limit))
             if tenth is None:
@@ -148,7 +148,7 @@ def _check_unlabelled(first: Feed, second: Feed) -> list[Check]:
 
 
 def _check_episodes(first: Feed, second: Feed) -> list[Check]:
-    """Compare the numbers of episodes that each cell was drawn from; these are not random."""
+    """Compare the numbers of episodes that each cell was drawn from, which are exact."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
     for index, cell in enumerate(first.cells):
@@ -162,7 +162,7 @@ def _check_episodes(first: Feed, second: Feed) -> list[Check]:
 
 
 def _episodes_per_run(feed: Feed, cell: int) -> float:
-    """Return the distinct episodes that a cell was drawn from, averaged over the arm's runs."""
+    """Return the number of distinct episodes that a cell was drawn from, averaged over runs."""
     drawn = feed.cell == cell
     pairs = np.stack([feed.run[drawn], feed.episode[drawn]])
     return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
@@ -173,18 +173,18 @@ def _check_distance(name: str, part: str, a: F64, b: F64, limit: float) -> Check
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
     low, high, lowest, highest = _interval(values[1:])
-    # Resampling adds noise, so two resamples are further apart than their originals. Mirrored about
-    # the figure, the interval errs to the other side. Taking the wider of both at each end avoids
-    # that noise alone leads to "same" or "different".
+    # Resampling adds noise: resamples are further apart than their originals, so their interval is
+    # too high. Mirrored about the original distance, it is too low. Each end is taken from the
+    # interval that reaches further, so that noise alone does not show "same" or "different".
     low, high = min(lowest, 2 * value - highest), max(high, 2 * value - low)
     return Check(name, part, None, None, value, max(low, 0.0), high, limit)
 
 
 def _check_ratio(name: str, a: F64, b: F64) -> Check:
-    """Check the larger share over the smaller; a, b (1 + R,) are originals, then resamples."""
+    """Check the ratio of larger to smaller share; a, b (1 + R,) are originals, then resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
-    logs[np.isnan(logs)] = 0.0  # 0 in both
+    logs[np.isnan(logs)] = 0.0  # both shares are 0
     low, high, lowest, highest = _interval(logs[1:])
     nearest = 0.0 if lowest <= 0 <= highest else min(abs(lowest), abs(highest))
     return Check(
@@ -203,14 +203,14 @@ def _interval(values: F64) -> tuple[float, float, float, float]:
     """Return the interval that may show "the same", and the wider one that may show "different".
 
     Feeds are the same only if all checks pass, but different if a single one fails. So the second
-    interval is widened for the number of checks (Bonferroni); else noise would fail one at times.
+    interval is widened for the number of checks (Bonferroni); else noise would sometimes fail one.
     """
     tail = (1 - LIMITS.confidence) / 2
     # Not interpolated, as interpolation between two infinite ratios is NaN.
     low, high = np.quantile(values, [tail, 1 - tail], method="nearest")
     if not np.isfinite(values).all():
         return float(low), float(high), float(values.min()), float(values.max())
-    # There are no resamples that far out, so the tail of a normal distribution is used.
+    # The wider interval reaches beyond the resamples, so it is that of a normal distribution.
     centre, spread = float(values.mean()), float(values.std())
     reach = NormalDist().inv_cdf(1 - tail / _CHECKS) * spread
     return float(low), float(high), centre - reach, centre + reach
@@ -246,7 +246,7 @@ def _resampled(feed: Feed, rng: np.random.Generator) -> F64:
         times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
         for kind, matrix in enumerate(matrices):
             drawn = (times @ matrix).reshape(-1, 10, cells)
-            # The share of fresh rows in a batch is a setting and not random, so it is kept.
+            # The share of fresh rows is a setting and not random, so resamples are scaled to it.
             was, now = total[kind][:, random].sum(-1), drawn[..., random].sum(-1)
             drawn *= (was / np.maximum(now, 1e-12))[..., None]
             sums[1 + start : 1 + stop, kind][..., random] = drawn[..., random]
@@ -283,7 +283,7 @@ _KINDS: dict[str, Kind] = {
     "config.device": "free",
     "config.threads": "free",
     "config.record": "free",
-    "config.profile": "free",  # a name or a file; its content is in `profile`
+    "config.profile": "free",  # a name or file; what it defines is compared in `profile`
     "config.target": "target",
     "config.evaluation.off_policy": "free",
     "config.evaluation": "evaluation",
@@ -310,7 +310,7 @@ _KINDS: dict[str, Kind] = {
     "next_value": "algorithm",
     "versions": "software",
 }
-_NO_SETTING = frozenset(  # keys of config.json that are no settings, or follow from other keys
+_NO_SETTING = frozenset(  # keys of config.json that are not settings, or follow from others
     {"format", "created_ns", "target", "seeds", "update_path", "profile_toml"}
 )
 
@@ -374,7 +374,7 @@ class Arm:
 
 
 def refuse_dependent(runs: Sequence[Run]) -> None:
-    """Refuse runs that are not independent seeds of one method: their spread would be too small.
+    """Refuse runs that are not independent seeds of one method, as their spread would be too small.
 
     Raises:
         RunError: there are no runs, their settings differ, or two runs are the same run, copies of
@@ -419,7 +419,7 @@ def same_run(first: Run, second: Run) -> bool:
 
 
 def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
-    """Return what each of two arms was fed; both feeds have the cells of either."""
+    """Return what each of two arms was fed; both feeds list the cells of both arms."""
     tables = first.fed(), second.fed()
     cells = sorted({name for table in tables for name in table["cell"].unique().to_pylist()})
     a, b = (_feed(table, cells) for table in tables)
@@ -456,7 +456,7 @@ def differences(first: Run, second: Run) -> list[Difference]:
     """Return the settings in which two runs differ, each with the kind of difference."""
     a, b = _settings(first), _settings(second)
     if a.get("panel.id") is None or b.get("panel.id") is None:
-        # If one run was fed no logs, that is a single difference of the feed, not of the store.
+        # If a run was fed no logs, keep only `panel.id`: the feed differs, not the store.
         for settings in (a, b):
             has = settings.get("panel.id") is not None
             for name in [name for name in settings if name.split(".")[0] == "panel"]:
@@ -486,7 +486,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def kind_of(setting: str) -> Kind:
-    """Return the kind of a setting, by its longest prefix in `_KINDS`; "algorithm" without one."""
+    """Return the kind of a setting, by its longest prefix in `_KINDS`; else "algorithm"."""
     parts = setting.split(".")
     for length in range(len(parts), 0, -1):
         if (kind := _KINDS.get(".".join(parts[:length]))) is not None:

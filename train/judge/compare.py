@@ -54,7 +54,7 @@ from restock.train.judge.comparability import (
 )
 from restock.train.run.run import Run
 
-_SAME_TOTAL = 1.02  # largest ratio of environment steps, and of updates
+_SAME_TOTAL = 1.02  # largest ratio between the arms' environment steps, or updates
 MIN_RUNS = 3  # seeds per arm; with fewer there is no interval
 
 
@@ -64,16 +64,16 @@ class Comparison:
 
     treatment: Treatment
     verdict: Verdict
-    differences: list[Difference]  # of settings
+    differences: list[Difference]  # in the arms' settings
     refused: list[Difference]  # differences that the treatment does not allow
-    totals: list[Check]  # of environment steps and updates
-    checks: list[Check]  # of the feed
-    source: str | None  # of the outcomes: "restock eval" or "training"; None without outcomes
+    totals: list[Check]  # whether environment steps and updates are the same
+    checks: list[Check]  # whether the critics were fed the same
+    source: str | None  # where outcomes come from: "restock eval" or "training"; None without any
     rows: list[dict[str, Any]]  # the outcomes, one per perturbation and condition
 
     @property
     def deciding_checks(self) -> list[Check]:
-        """Return the checks that decide the verdict; the treatment excludes some of the feed."""
+        """Return the checks that decide the verdict; some treatments exempt checks of the feed."""
         return _deciding(self.treatment, self.totals, self.checks)
 
     @property
@@ -187,7 +187,7 @@ def _total(name: str, first: float, second: float) -> Check:
 
 
 def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
-    """Return the source of the episodes, and an outcome per condition and perturbation of both.
+    """Return the source of the episodes, and an outcome per condition and perturbation in both.
 
     Raises:
         RunError: a run has no evaluation, or the arms share no episode.
@@ -216,7 +216,7 @@ def _outcome(
 ) -> dict[str, Any]:
     difference = difference_of_arms(a[..., 0], b[..., 0]).within(-1.0, 1.0)
     missing = _explain_no_interval(a, b, difference)
-    # Compares each episode over all pairs of runs.
+    # The probability that a run of b beats a run of a on an episode.
     better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
     few = min(len(a), len(b)) < MIN_RUNS or a.shape[1] < MIN_EPISODES
     return {

@@ -48,11 +48,11 @@ from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.floors.layout import DEFAULT
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
-WINDOWS = 3  # figures are medians over this many last windows
-_SETTLED_LAGS = 10  # mean ages of the target after which even a young critic's L is low
-_MIN_UPDATES = 1500  # from here on L is judged even if the rule is slower, unless L is falling
-_FALLING = 0.75  # the last L over the first of the last windows; below it, L is falling
-_WORKING_LAGS = 50, 800  # mean ages of a target, in updates, from which most critics can learn
+WINDOWS = 3  # number of windows (evaluations), the last ones, over which figures are medians
+_SETTLED_LAGS = 10  # a run is old enough to judge L after so many mean ages of its target
+_MIN_UPDATES = 1500  # updates from which L is judged in younger runs, too, unless it is falling
+_FALLING = 0.75  # L is falling if its ratio of the last to the first window is below this
+_WORKING_LAGS = 50, 800  # range of a target's mean age, in updates, with which most critics learn
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class Diagnosis:
     """The verdict on one or more runs (seeds of one method), with the evidence."""
 
     cause: Cause
-    runs: list[Cause]  # per run
+    runs: list[Cause]  # cause per run
     figures: list[Window]  # per run, the median over its last windows
     windows: list[list[Window]]  # per run, in order of time
     evidence: list[str]
-    experiment: str  # that would confirm the cause
+    experiment: str  # what to try, in words, to confirm the cause
 
 
 def diagnose(runs: Sequence[Run]) -> Diagnosis:
@@ -109,10 +109,10 @@ def target_rule(run: Run) -> TargetRule:
 
 
 def other_target(rule: TargetRule) -> Polyak:
-    """Return a target rule to try in place of `rule`, to test whether that is at fault.
+    """Return a target rule to try in place of `rule`, to test whether `rule` is at fault.
 
-    It is the default rule if `rule` is far too slow or too fast, else one with a quarter of its
-    lag.
+    This is the default rule if `rule` is far too slow or too fast, else a rule with a quarter of
+    the lag of `rule`.
     """
     least, below = _WORKING_LAGS
     lag = rule.effective_lag
@@ -148,8 +148,8 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
 def _explain_youth(last: Sequence[Window], rule: TargetRule) -> str:
     """Explain why the run may be too young to judge an L past its limit; "" if it is not.
 
-    While values grow from 0, every target lags. But if a rule is so slow that no run would be old
-    enough, L does not fall, and the rule is at fault.
+    While values grow from 0, every target lags. Then L falls later on. If it does not
+    fall, the rule is too slow for any run to be old enough, and the rule is at fault.
     """
     updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
     if updates >= settled:
@@ -189,7 +189,7 @@ def _experiment(
     cause: Cause,
     windows: Sequence[Window],
     rule: TargetRule,
-    advice: str,  # if the cause is UNDETERMINED
+    advice: str,  # what to do if the cause is UNDETERMINED
 ) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad())
     which = ", ".join(named) or "the condition with the largest gap"
@@ -207,7 +207,7 @@ def _experiment(
     }[cause]
 
 
-_WITH_WRONG_ROWS: dict[Cause, Cause] = {  # a run's cause -> its cause if its rows are wrong, too
+_WITH_WRONG_ROWS: dict[Cause, Cause] = {  # cause by the run's figures -> cause with wrong rows
     "HEALTHY": "BUFFER",
     "UNDETERMINED": "BUFFER",
     "TARGET": "BOTH",
@@ -303,7 +303,7 @@ def confirm(
     if what is not None:
         raise RunError(f"is {cause}: {what}", where=where, remedy=remedy)
     panel = run.document["panel"]
-    given = config["teacher"]  # resolved; includes settings that have no effect with its source
+    given = config["teacher"]  # lists all settings, also those that its source ignores
     resolved = parse_config(config, where=where)
     has = {"source", *(key for key in given if has_effect(resolved, key))}
     taught = {key: value for key, value in given.items() if key in has}
@@ -315,7 +315,7 @@ def confirm(
     finally:
         session.close()
     after = diagnose([Run.open(out)])
-    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # what was replaced
+    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # the replaced part
     still = after.cause in (suspected, "BOTH")
     return {
         "changed": changed,
@@ -334,7 +334,7 @@ def swapped(run: Run, cause: Cause) -> list[str]:
     if cause in ("TARGET", "BOTH"):
         tau = other_target(target_rule(run)).tau
         return [f"target={{rule='polyak', tau={tau:g}}}"]
-    # Another feed: only fresh rows, of all evaluated conditions equally often.
+    # Replace the feed: only fresh rows, of all conditions equally often.
     share = 1 / len(config["env"]["conditions"])
     names = list(config["env"]["conditions"])
     natural = "practice={rule='natural'}"

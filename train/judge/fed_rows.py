@@ -48,7 +48,7 @@ class Comparison:
 
     check: str  # its name in `causes.toml` and the docs
     what: str  # what was compared, for people
-    measure: str  # of `effect`: "ratio", "difference", "share", …
+    measure: str  # what `effect` is: "ratio", "difference", "share", …
     status: Status
     logs: float | None = None
     twin: float | None = None
@@ -110,7 +110,7 @@ def _p_value(interval: ConfidenceInterval, least: float, most: float) -> float:
 def correct_over_parts(parts: Sequence[Sequence[Comparison]]) -> None:
     """Correct each check for the number of parts (robots, recordings) in which it was made.
 
-    With Holm's method, a check is as likely to be off in any part of sound logs as a single test.
+    Holm's method: in sound logs, a check is off in any of the parts as rarely as a single test.
     """
     by_check: dict[str, list[Comparison]] = {}
     for row in chain.from_iterable(parts):
@@ -177,7 +177,7 @@ class Flags:
     note: str = ""
 
     def of(self, rows: FedRows) -> Comparison:
-        """Judge the share that is off, of those of these rows that were checked."""
+        """Judge which share of these rows is off, among those that were checked."""
         inside = np.isin(self.transition_id, rows.transition_id)
         found = int(self.off[inside].sum())
         return share_judged(
@@ -191,8 +191,8 @@ _COLUMNS = (
     "next_observation",
 )
 FEW_EPISODES = 20  # with fewer, a bootstrap draws stretches of `BLOCK_STEPS` in place of episodes
-BLOCK_STEPS = 50  # more steps than a step is correlated with
-MAX_ROWS = 40_000  # that are read of a store or panel, in whole episodes from a fixed shuffle
+BLOCK_STEPS = 50  # steps this far apart are no longer correlated
+MAX_ROWS = 40_000  # at most about so many rows are read, in whole episodes from a fixed shuffle
 
 
 @dataclass(frozen=True)
@@ -207,25 +207,25 @@ class FedRows:
     terminated: Bools  # (N,)
     truncated: Bools  # (N,)
     episode: Ints  # (N,) codes, ascending
-    step: Ints  # (N,) in its episode
+    step: Ints  # (N,) number of the step in its episode
     recording: NDArray[np.str_]  # (N,)
     robot: NDArray[np.str_]  # (N,) the recording's tag; "" if it has none
     logged_ns: Ints  # (N,)
     condition: NDArray[np.str_]  # (N,)
     transition_id: Ints  # (N,)
-    # Only if the rows' store is there:
+    # These are None if the rows' store is missing:
     pose: F64 | None = None  # (N, 3) on the map: x and y in m, heading in rad
     success: F64 | None = None  # (N,) of the row's episode; NaN if unknown
-    held: NDArray[np.object_] | None = None  # (N,) lists of conditions and exposures
+    held: NDArray[np.object_] | None = None  # (N,) pairs of sets: conditions, exposures
     driver: NDArray[np.str_] | None = None  # (N,) behaviour policy; "" if unknown
-    counted: Ints | None = None  # (N, 2) rows of its recording: written at ingest, still stored
+    counted: Ints | None = None  # (N, 2) rows of its recording: written by ingest, still stored
     left_out: dict[str, int] = field(default_factory=dict)  # reason -> rows that were left out
 
     def __len__(self) -> int:
         return len(self.action)
 
     def take(self, chosen: Bools, **left_out: int) -> FedRows:
-        """Return some of the rows; `left_out` counts the others by reason."""
+        """Return the chosen rows; `left_out` counts the others by reason."""
         arrays: dict[str, Any] = {
             item.name: value[chosen]
             for item in fields(self)
@@ -242,7 +242,7 @@ class FedRows:
 
     @cached_property
     def cluster(self) -> Ints:
-        """Return the codes (N,) of what a bootstrap draws: episodes, or stretches of a few."""
+        """Return each row's bootstrap unit, (N,): its episode, or a stretch if episodes are few."""
         if len(np.unique(self.episode)) >= FEW_EPISODES:
             return self.episode
         stretch = self.step // BLOCK_STEPS
@@ -491,7 +491,7 @@ def _rows_of_ended_episodes(
     steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
     flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
     ended = steps["ended"]
-    later = np.cumsum(ended[:, ::-1], axis=1)[:, ::-1].reshape(-1)  # ends from this step on
+    later = np.cumsum(ended[:, ::-1], axis=1)[:, ::-1].reshape(-1)  # number of ends from here on
     robot = np.repeat(np.arange(len(ended)), ended.shape[1])
     episode = np.unique(robot * (ended.shape[1] + 1) - later, return_inverse=True)[1].reshape(-1)
     broken = np.isin(episode, episode[flat["invalid"]])

@@ -49,12 +49,12 @@ from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS
 
 Document = dict[str, Any]
-FOLDER = "gate"  # in a run
+FOLDER = "gate"  # relative to the run's folder
 DOCUMENT, EPISODES = "gate.json", "episodes.parquet"
-ERROR = 0.05  # of the whole verdict
+ERROR = 0.05  # largest probability that the whole verdict is wrong
 FIRST_SEED = 1_000_000  # far from the seeds of evaluations
-ROUND = 32  # pairs of a kind that are driven between two checks of what is decided
-MAX_MISSIONS = 3  # a kind of mission may drive this many budgets, as it may have several cells
+ROUND = 32  # pairs of episodes per kind between two checks of which cells are decided
+MAX_MISSIONS = 3  # limit of a kind's missions, in budgets: a kind may have several cells
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Measure:
 
 
 def _less(name: str) -> Callable[[EpisodeResult, EpisodeResult], float | None]:
-    """Return a `better` that is the baseline's value of a field less the policy's."""
+    """Return a `better` function: the baseline's value of a field less the policy's."""
 
     def better(policy: EpisodeResult, baseline: EpisodeResult) -> float | None:
         own, other = getattr(policy, name), getattr(baseline, name)
@@ -121,8 +121,8 @@ class Cell:
     condition: str  # with the blocked share of the aisle, if it has one
     measure: Measure
     margin: float  # in the measure's unit
-    error_high: float  # of calling it worse
-    scale: float = 1.0  # difference between two episodes per unit of the margin
+    error_high: float  # largest probability of wrongly calling the policy worse
+    scale: float = 1.0  # converts the margin's unit to that of differences between episodes
     pairs: int = 0
     unknown: int = 0  # pairs in which the measure is None
 
@@ -198,8 +198,8 @@ class GatePlan:
 
     plans: tuple[EvaluationPlan, ...]  # one per value of `layouts`
     margins: Mapping[str, float]  # by measure
-    budget: int  # pairs per cell
-    gap: TwinGap | None  # None if it was not measured
+    budget: int  # largest number of pairs per cell
+    gap: TwinGap | None  # gap of the twin to the logs; None if not measured
 
     @property
     def run(self) -> Run:
@@ -283,7 +283,7 @@ def policy_name(baseline: str) -> str:
 
 
 def find_gap(run: Run) -> TwinGap | None:
-    """Read the twin's gap to the logs, measured for the run or its panel's store, if it was."""
+    """Read the twin's gap to the logs, of the run or its panel's store; None if not measured."""
     panel = run_panel(run.document)
     places = [run.path]
     if panel is not None and "://" not in str(panel.header.store):
@@ -317,7 +317,7 @@ def _check_budget(budget: int, margins: Mapping[str, float]) -> None:
     needed = max(
         pairs_needed(MEASURES[name].bound, -margin, variance=MEASURES[name].variance)
         for name, margin in margins.items()
-        if name != BUMPS  # its margin is known once the baseline has driven
+        if name != BUMPS  # its margin per episode depends on how far the baseline drives
     )
     if budget < needed:
         raise ConfigError(
@@ -390,7 +390,7 @@ def _drive(
     cells: dict[tuple[str, ...], Cell],
     progress: Callable[[str], None],
 ) -> pa.Table:
-    """Drive on one set of floors, add to `cells`, and return the table of episodes."""
+    """Drive pairs on one set of floors, add them to `cells`, and return the table of episodes."""
     env = evaluation_env(plan)
     env.limits = plan.limits
     drivers = {name: make_policy(name, plan) for name in plan.policies}
@@ -440,7 +440,7 @@ def _is_open(
     kind: str,
     done: int,
 ) -> bool:
-    """Return whether missions of a kind may still decide something."""
+    """Return whether more missions of a kind may still decide one of its cells."""
     if done >= MAX_MISSIONS * gate.budget:
         return False
     own = [
@@ -472,7 +472,7 @@ def _document(plan: GatePlan, cells: Sequence[Cell]) -> Document:
 
 
 def _claim(plan: GatePlan, cells: Sequence[Document], verdict: str) -> str:
-    """Return what was shown as a sentence."""
+    """Return a sentence on what was shown."""
     who = f"the policy of {plan.run.path.name} against {plan.baseline}"
     names = {
         word: list(dict.fromkeys(cell["name"] for cell in cells if cell["verdict"] == word))

@@ -43,11 +43,11 @@ from restock.train.twin.floors.placed import (
 
 LOST = "rows lost"
 NEARER = "goals come nearer"
-AWAY = 0.05  # of the missions
+AWAY = 0.05  # largest share of missions at fault
 _DRIVEN_M = 2.0  # shorter drives do not show whether a mission goes to its goal
-_SHORTER = 0.3  # least metres by which the plan becomes shorter per metre driven
-_JUMP = 0.06  # in tens of metres of plan; larger changes in one step mean that it was replaced
-_STRAIGHT = 0.7  # least distance from start to end over metres driven; less is wandering
+_SHORTER = 0.3  # a mission strays if its plan becomes shorter by less than this per metre driven
+_JUMP = 0.06  # in units of 10 m; larger changes in one step mean that the plan was replaced
+_STRAIGHT = 0.7  # with less distance from start to end per metre driven, a mission only wanders
 FLOOR = "floor"
 MOVED_M = 0.25
 _SEARCH_M, _STEP_M, _FINE_M = 2.5, 0.25, 0.05
@@ -56,19 +56,19 @@ _MISSIONS = 6  # fewer missions with lidar returns are not compared with a floor
 RANGES, SECTORS, ON_RACKS = "lidar ranges", "lidar sectors", "missions racks"
 ON_FLOOR = 0.5  # least share of ranges that agree with the floor; with less, it is another floor
 RANGE_M = 0.1
-BLIND = 0.0  # of the sectors
-_LOOKS, _RAYS = 800, 3  # rows that are compared, and rays per sector
-_NEARBY = 0.6  # of the lidar's range: nearer walls should be seen
-_MIN_GAIN = 0.05  # least gain in the share that agrees, for a move of the racks to be applied
-_MIN_LOOKS = 40  # ranges without which a sector or a mission is not judged
+BLIND = 0.0  # largest share of sectors that may be blind
+_LOOKS, _RAYS = 800, 3  # number of rows to compare, and of rays per sector
+_NEARBY = 0.6  # walls within this share of the lidar's range should be seen
+_MIN_GAIN = 0.05  # racks are moved only if the share of ranges that agree rises by at least this
+_MIN_LOOKS = 40  # least ranges for a sector or a mission to be judged
 DRIVEN = "driver"
-OTHER_DRIVER = 0.1  # of the stretches
+OTHER_DRIVER = 0.1  # largest share of stretches in another's style, beyond the usual share
 _MAX_CONFUSED = 0.1  # largest share of the others' stretches that may be taken for another driver's
-_STRETCH = 10  # steps
+_STRETCH = 10  # shorter stretches, in steps, are not counted
 CHOSEN = "chosen on outcome: "
-GAP = 0.3  # in the share of episodes that succeed
-_MIN_MISSIONS = 5  # with a condition, and without it
-_MIN_EXPOSED = 0.2  # share of a condition's episodes in which its situations (exposures) occur
+GAP = 0.3  # largest difference in success without and with a condition
+_MIN_MISSIONS = 5  # least missions with and without a condition, and least stretches of a driver
+_MIN_EXPOSED = 0.2  # exposures in at least this share of a condition's episodes are its situations
 
 _SIGNALS = (
     f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
@@ -104,7 +104,7 @@ def with_missions(store: Store, rows: FedRows) -> FedRows:
 def mission_checks(
     logs: FedRows, twin: FedRows | None, floors: Sequence[Warehouse], others: FedRows | None = None
 ) -> Iterator[Comparison]:
-    """Check lost rows, goals, the floor, whether conditions come from failures, and who drove.
+    """Check lost rows, goals, the floor, whether conditions follow from outcomes, and drivers.
 
     `others` are the rows of the other robots or recordings, if `logs` are only a part.
     """
@@ -233,7 +233,7 @@ def _check_ranges(
         least, most = _expected_clearance(rows.task, floor, rows.pose[kept], by)
         shown = (least > 0.1) & (least < _NEARBY * rows.task.range_max_m) & (most - least < 0.6)
         if twin is not None:
-            shown &= (twin.sectors() < 1.0).any(axis=0)  # those that the twin's lidar covers
+            shown &= (twin.sectors() < 1.0).any(axis=0)  # sectors that the twin's lidar covers
         off = clearance - least
         near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
         if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
@@ -279,7 +279,7 @@ def _expected_clearance(task: Task, floor: Warehouse, pose: F64, move: F64) -> t
         for rack in (Rect(0.0, 0.0, floor.width_m, floor.depth_m), *floor.racks):
             ends = [np.stack([rack.edges[at] - x, rack.edges[at + 1] - y]) * along for at in (0, 2)]
             near, far = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
-            hit = far if nearest.min() == 1e6 else near  # the first is the floor, from inside
+            hit = far if nearest.min() == 1e6 else near  # first: the floor's outline, from inside
             nearest = np.where((hit > 0) & (near <= far), np.minimum(nearest, hit), nearest)
     clear = (nearest - outline_reach(bearing, task.body)).reshape(len(pose), task.sectors, _RAYS)
     return clear.min(axis=2), clear.max(axis=2)
@@ -319,7 +319,7 @@ def _check_driver(rows: FedRows, others: FedRows | None) -> Comparison:
 
 
 def _split_by_driver(rows: FedRows) -> tuple[Ints, NDArray[np.str_]]:
-    """Return each row's stretch (N,), of one driver in one episode, and each stretch's driver."""
+    """Split rows by driver and episode into stretches; return each row's, (N,), and the drivers."""
     assert rows.driver is not None
     begins = np.append(True, (np.diff(rows.episode) != 0) | (rows.driver[1:] != rows.driver[:-1]))
     return np.cumsum(begins) - 1, rows.driver[begins]
@@ -340,7 +340,7 @@ def _driving_features(rows: FedRows) -> F64:
 
 
 def _best_move(floor: Warehouse, places: F64) -> F64:
-    """Return the move (2,) with which places fit walls best; longer ones have a small penalty."""
+    """Return the move (2,) with which places fit walls best; long moves have a small penalty."""
     places = places[:: len(places) // _RETURNS + 1]
     best = np.zeros(2)
     for step, reach in ((_STEP_M, _SEARCH_M), (_FINE_M, _STEP_M)):

@@ -40,7 +40,7 @@ from restock.train.judge.fed_rows import (
 )
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
-MOST = 0.005  # of the rows; by definition no row may be off
+MOST = 0.005  # largest share of rows that may be off; by definition, none should be
 _EQUAL = 1e-4
 
 
@@ -104,18 +104,18 @@ def _differ(first: F32, second: F32) -> Bools:
     return np.asarray((np.abs(first - second) > _EQUAL).any(axis=1), np.bool_)
 
 
-SCALE = 1.05  # largest ratio of rewards, or its inverse
-OTHER = 0.05  # of the rows
-LOST = 0.05  # of the ends
+SCALE = 1.05  # largest ratio of rewards to the task's own, either way
+OTHER = 0.05  # largest share of rows with another reward than the task's own
+LOST = 0.05  # largest share of ends of episodes that may be wrong
 UNCAUSED = "terminated without cause"
 _JUMP_M = 0.9  # larger changes in one step mean that the plan was replaced
 _TOUCHING_M = 0.05
-_MIN_REWARD = 0.05  # a reward, or its error, above the noise of float32 and clearances
-_ARRIVED_M = 0.15  # plan left beyond the goal's radius: a plan is never shorter than the distance
+_MIN_REWARD = 0.05  # rewards and errors below this may be noise of float32 and clearances
+_ARRIVED_M = 0.15  # added to the goal's radius, as plans are no shorter than the distance
 
 
 def implied_reward(rows: FedRows) -> F64:
-    """Return the reward (N,) that follows from the observations; NaN if they do not tell."""
+    """Return the reward (N,) that the observations imply; NaN if they do not imply one."""
     task = rows.task
     clearance = np.full(len(rows), np.nan)
     if task.lidar:
@@ -239,17 +239,17 @@ def _goal_reward(logs: FedRows, twin: FedRows | None) -> Comparison:
                   least=1 / SCALE, most=SCALE, logs_rows=int(there.sum()))  # fmt: skip
 
 
-BEYOND = 0.02  # of the rows
-SPREAD = 10.0  # largest ratio to the twin's, or its inverse
+BEYOND = 0.02  # largest share of rows that may be far beyond the twin's range
+SPREAD = 10.0  # largest ratio of a value's spread to the twin's, either way
 TURNED_DEG = 20.0
-LIDAR_SCALE = 1.5  # largest ratio to the twin's, or its inverse
+LIDAR_SCALE = 1.5  # largest ratio of the lidar's scale to the twin's, either way
 MEASURED = (
     *("wheel_speed", "localised_speed", "lateral_speed", "gyro_yaw_rate", "accel_x"),
     "goal_distance",
 )
-CLEARANCES = "clearances"  # their mean over all sectors
+CLEARANCES = "clearances"  # name of the lidar's mean over all sectors
 _MAY_BE_STILL = ("lateral_speed",)  # always 0 if a robot does not slide
-_WIDER = 1.0  # allowed beyond the twin's range on each side, as a share of this range
+_WIDER = 1.0  # values may exceed the twin's range by this share of it on each side
 _STRAIGHT_RADPS = 0.15
 _DRIVING_MPS = 0.25
 _FAR = 0.97  # lidar entries beyond this saw nothing
@@ -304,8 +304,8 @@ def _check_entry(
 def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
     """Check the lidar's bearing, and its scale against the twin's.
 
-    The bearing is the rotation in degrees at which the approach of things by sector is most like
-    the twin's, or like a cosine without a twin. The scale is how much nearer things come per metre.
+    The approach is how much nearer things come per metre, by sector. The bearing is the rotation in
+    degrees between the logs' and the twin's approach (or a cosine), and the scale is their ratio.
     """
     what = "bearing in which things come nearer when driving straight on"
     if not logs.task.lidar:
@@ -373,9 +373,9 @@ def _measure_approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     return np.asarray(slope - slope.mean(axis=1, keepdims=True))
 
 
-FAR = 0.25  # distance of a command from its action, in units of the fastest action
-COARSE = 0.1  # largest share of such commands
-DIFFERENT = 0.02  # of the rows that have a label, or should have it
+FAR = 0.25  # commands further than this from their action are far; 1 is the fastest action
+COARSE = 0.1  # largest share of far commands
+DIFFERENT = 0.02  # largest share of wrong labels among rows that have, or should have, the label
 _LABELS = "row's label differs from what its conditions give on the stored signals"
 _FED = "row's label in the panel differs from that in its store"
 _ENDS = "termination of the row does not agree with its signals"

@@ -20,20 +20,20 @@ import numpy as np
 from restock.arrays import F64
 
 NOT_WORSE, WORSE, NOT_SHOWN = "not worse", "worse", "not shown"  # verdicts on a limit
-CANDIDATES = 400  # intervals between -bound and bound; bets are made on each value between them
+CANDIDATES = 400  # [-bound, bound] is cut into so many intervals; bets are made on each border
 PRIOR_PAIRS = 50  # the assumed variance counts as much as this many pairs
-CAUTION = 0.8  # of the bet with the fastest growth: fewer worse policies then pass by chance
+CAUTION = 0.8  # share of the fastest-growing bet: fewer worse policies then pass by chance
 MAX_STAKE = 0.9  # share of the wealth that a bet may lose
 
 
 class ConfidenceSequence:
-    """Bounds of the mean of differences in [-bound, bound] that hold after all pairs at once.
+    """Bounds on the mean of differences within ±bound that hold for every number of pairs at once.
 
     Attributes:
         low, high: the bounds after each pair, lists of n. The probability that the mean is below
             any `low` is at most `error_low`; that it is above any `high`, at most `error_high`.
         above_at: number of pairs after which the mean was shown to be above `limit`, or None.
-        below_at: the same for below.
+        below_at: number of pairs after which it was shown to be below `limit`, or None.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class ConfidenceSequence:
         self._limit_at = int(np.searchsorted(self.candidates, limit))
         self._variance = variance
         self._needed = math.log(1 / error_low), math.log(1 / error_high)
-        self._wealth = np.zeros((2, len(self.candidates)))  # log; bets on above, on below
+        self._wealth = np.zeros((2, len(self.candidates)))  # log wealth of bets on above, on below
         self._most = np.zeros_like(self._wealth)  # largest `_wealth` so far
         self.pairs, self._sum, self._squares = 0, 0.0, 0.0
         self.low: list[float] = []
@@ -81,7 +81,7 @@ class ConfidenceSequence:
         self.pairs += 1
         self._sum += difference
         self._squares += difference**2
-        not_below = self._most[0] < self._needed[0]  # the mean is not shown to be above these
+        not_below = self._most[0] < self._needed[0]  # candidates not shown to be below the mean
         not_above = self._most[1] < self._needed[1]
         self.low.append(float(self.candidates[not_below][0]) if not_below.any() else self.bound)
         self.high.append(float(self.candidates[not_above][-1]) if not_above.any() else -self.bound)
@@ -97,15 +97,15 @@ def bets(
     """Return the next bets that the mean is above, and below, each value `at`.
 
     The bet that makes wealth grow fastest is about gain / (spread + gain**2), where gain is the
-    mean less the value. The mean is estimated from the differences so far and `PRIOR_PAIRS` zeros;
-    the estimate is no worse for the bet than half the value.
+    mean less the value. The mean is estimated from the differences so far and `PRIOR_PAIRS` zeros,
+    but as at least half a negative value (when betting on below, at most half a positive one).
 
     Args:
         at: values, of any shape.
         pairs: number of differences so far.
-        total, squares: their sum and the sum of their squares; must broadcast with `at`.
+        total, squares: sum of the differences, and of their squares; must broadcast with `at`.
         bound: the largest possible difference.
-        variance: assumed before the first difference.
+        variance: variance that is assumed before the first difference.
     """
     mean = total / (PRIOR_PAIRS + pairs)
     spread = (PRIOR_PAIRS * variance + squares) / (PRIOR_PAIRS + pairs)

@@ -33,7 +33,7 @@ from restock.train.run.run import Run
 
 Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 _MIN_ROWS = 20  # held-out rows that a condition needs to be diagnosed
-_MIN_TD_ROWS = 100  # and for its TD errors, which scatter by factors over a few episodes
+_MIN_TD_ROWS = 100  # held-out rows that its TD errors need, as they vary by factors in few episodes
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,17 @@ class DiagnosisLimits:
     """Limits beyond which a figure is a symptom."""
 
     gap: float = 3.0  # G_k of a condition; O_k if the condition is not in replay
-    relative: float = 3.0  # G_k over the median G; both limits must be exceeded
+    relative: float = 3.0  # G_k over the median G; `gap` must be exceeded, too
     gap_everywhere: float = 6.0  # the median G: everything is worse held out
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is effectively no target network
     clock: float = 2.0  # S: the networks disagree
-    returns: float = 3.0  # |Q| over the largest return of an episode, whose rewards may cancel
-    explained: float = 0.2  # of the targets' variance; a critic below it has learnt nothing
-    supply: float = 0.1  # least share of replay over the share of driving, of a condition
+    returns: float = 3.0  # |Q| over an episode's largest |return|, in which rewards may cancel
+    explained: float = 0.2  # share of the targets' variance; a critic below it has learnt nothing
+    supply: float = 0.1  # least ratio of a condition's share of replay to its share of driving
     agreement: float = 0.1  # least share of a condition's logged rows that look like fresh ones
-    unexplained: float = 1.0  # of the next observations' variance; 1: their mean explains as much
-    unexplained_relative: float = 1.6  # over the condition with the least; both limits count
+    unexplained: float = 1.0  # share of next observations' variance; at 1 their mean does as well
+    unexplained_relative: float = 1.6  # ratio to the best condition's; `unexplained` applies, too
 
 
 LIMITS = DiagnosisLimits()
@@ -65,9 +65,9 @@ class Symptom:
     gap: float | None  # G_k; None: not in replay, or too few rows
     outlier: float | None  # O_k; None: too few rows
     replay_share: float
-    met_share: float | None  # share of the evaluations' steps
+    met_share: float | None  # share of the steps driven in evaluations
     agreement: float | None  # share of its logged rows that look like fresh ones
-    unexplained: float | None  # share of the variance of its logged rows' next observations
+    unexplained: float | None  # share of the variance of next observations in its logged rows
 
     @property
     def supply(self) -> float | None:
@@ -165,7 +165,7 @@ class Window:
         """Return whether values exceed what rewards allow, or hardly explain their targets."""
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return True
-        # A frozen target can leave its values unexplained, too; then the target is at fault.
+        # With a frozen target, Q may explain little, too; then the target is at fault.
         if self.explained is None or self.target():
             return False
         return self.explained < LIMITS.explained
