@@ -42,20 +42,20 @@ class Steps:
 
     signals: Signals  # every signal, leading axis T
     segment: Ints  # (T,) index of the clock segment
-    follows: Bools  # (T,) comes directly after the tick before, and both are usable
-    break_reason: list[str]  # (T,) why it does not follow, or ""
-    problem: list[str]  # (T,) why the tick is unusable whatever its route, or ""
-    route_problem: list[str]  # (T,) why its route is unusable, or ""
+    follows: Bools  # (T,) whether the tick directly follows the one before, and both are usable
+    break_reason: list[str]  # (T,) why the tick does not follow, or ""
+    problem: list[str]  # (T,) why the tick is unusable, apart from its route, or ""
+    route_problem: list[str]  # (T,) why the tick's goal or plan is unusable, or ""
     routing: Routing
-    action: Ints  # (T,)
-    residual: F64  # (T,) scaled distance from the command to that action
-    policy: list[str]  # (T,)
-    policy_version: list[str | None]  # (T,)
-    probability: list[float | None]  # (T,)
+    action: Ints  # (T,) index of the action nearest to the command
+    residual: F64  # (T,) distance of that action from the command, scaled as in `nearest_action`
+    policy: list[str]  # (T,) name of the behaviour policy, which drives
+    policy_version: list[str | None]  # (T,) the policy's version; None: unknown
+    probability: list[float | None]  # (T,) the policy's chance of choosing the action; None: unknown
     truth: list[str | None]  # (T,) true conditions, if a simulator published them
     true_exposure: list[str | None]  # (T,) likewise for exposures
     perturbed: Perturbed  # (T,) a simulator's parameters in force
-    logged_ns: Ints  # (T,) log time
+    logged_ns: Ints  # (T,) the tick's time as log time
     clock: ClockReport
     commands_between: int  # commands without a tick of their own
     custom: Custom  # the profile's custom signals
@@ -155,7 +155,7 @@ class EpisodeSpan:
     last: int
     terminated: bool
     ended_by: str
-    shared: bool  # whether the last tick also begins the next episode, or is dropped
+    shared: bool  # whether the last tick counts again: it begins an episode, or is dropped
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def split(task: Task, steps: Steps) -> Split:
     """Split a recording's steps into episodes."""
     changed, routing = changed_route(steps), steps.routing
     old_route = np.zeros(len(steps), np.bool_)
-    if len(changed):  # computed with the goal and plan of the tick before
+    if len(changed):  # these ticks may end an episode that has the route of the tick before
         goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
         old_route[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
     return _Walk(task, steps, terminated(task, steps.signals), old_route).walk()
@@ -224,12 +224,12 @@ def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) ->
 
 
 def protective_stop(task: Task, steps: Steps) -> Bools:
-    """Return which ticks (T,) are within RELEASE_S after a press, if bumps terminate episodes."""
+    """Return which ticks (T,) are within RELEASE_S after a bump, if bumps terminate episodes."""
     pressed = steps.signals["bumped"].astype(np.bool_) & task.bump_terminates
     latest = np.maximum.accumulate(np.where(pressed, np.arange(len(steps)), -1))
     stamp_ns = steps.signals["stamp_ns"]
     since_s = (stamp_ns - stamp_ns[latest]) * 1e-9
-    until_s = RELEASE_S - task.control_period_s / 2  # rounds to the nearest tick: stamps jitter
+    until_s = RELEASE_S - task.control_period_s / 2  # half a period less, as stamps jitter
     return (latest >= 0) & (since_s >= 0) & (since_s < until_s)
 
 
@@ -238,8 +238,8 @@ class _Walk:
 
     def __init__(self, task: Task, steps: Steps, terminated: Bools, old_route: Bools) -> None:
         self.task, self.steps = task, steps
-        self.terminated = terminated  # (T,)
-        self.old_route_terminated = old_route  # (T,) with the goal and plan of the tick before
+        self.terminated = terminated  # (T,) whether an episode terminates at the tick
+        self.old_route_terminated = old_route  # (T,) likewise, for the route of the tick before
         self.goal = steps.routing.goal.tolist()
         self.order = steps.routing.order.tolist()
         self.episodes: list[EpisodeSpan] = []
@@ -258,7 +258,7 @@ class _Walk:
         return Split(self.episodes, dict(self.dropped))
 
     def _continues(self, tick: int, first: int, follows: bool) -> bool:
-        """Return whether the open episode uses this tick; close it if it ends by this tick."""
+        """Return whether the open episode takes this tick; close the episode if it ends here."""
         if not follows:
             self._close(tick - 1, self.steps.problem[tick] or self.steps.break_reason[tick])
             return False

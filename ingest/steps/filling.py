@@ -59,8 +59,8 @@ from restock.ingest.task.task_sql import Past, observed_in_log
 from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
 from restock.ingest.task.tracks import Tracker
 
-# Larger numbers are faults, whatever the signal's unit. A position in float32, as stored, would not
-# even resolve centimetres.
+# Larger numbers are faults, whatever the signal's unit. A position above it, stored as float32,
+# would not even resolve centimetres.
 LARGEST = 1e6
 TOO_LARGE = "beyond a million"
 _CHUNK = 4096  # ticks processed at a time: bounds memory for recordings of any length
@@ -70,7 +70,7 @@ _CHUNK = 4096  # ticks processed at a time: bounds memory for recordings of any 
 class Routing:
     """The goals and plans of a recording, and those in force at each of T ticks.
 
-    A tick without a plan has look-ahead points on the robot's forward axis, and nothing remaining.
+    A tick without a plan has look-ahead points straight ahead of the robot, and 0 m remaining.
     """
 
     goals_m: F64  # (G, 2)
@@ -109,7 +109,7 @@ class Routing:
         aimed = np.flatnonzero(goal >= 0)
         position = np.stack([now["pose_x_m"], now["pose_y_m"]], axis=-1)
         distance[aimed] = np.linalg.norm(self.goals_m[goal[aimed]] - position[aimed], axis=-1)
-        # Copied, so that the points between them are freed.
+        # Copies, so that the array of all look-ahead points can be freed.
         near, far = (seen.look_ahead_m[:, part * PLAN_PARTS].T.copy() for part in (1, 2))
         way_m, gap_m = returns_on_plan(task, now["sector_clearance_m"], seen.look_ahead_m)
         return {
@@ -172,7 +172,7 @@ def plan_ends(plans_m: Sequence[F64]) -> F64:
 
 GOAL_MOVED_M = 0.01  # a goal farther from the last one is a new goal
 PLAN_GOAL_TOLERANCE_M = 0.5  # a plan that ends farther from the goal is for another goal
-# What replaces a field of the IMU whose messages have no estimate, as text for notes.
+# Text for notes: what replaces a field of the IMU in messages without an estimate of it.
 NO_ESTIMATE = {
     "angular_velocity": ": gyro yaw rate taken from the wheels",
     "linear_acceleration": ": acceleration 0",
@@ -203,7 +203,7 @@ class Filling:
         """Compute every signal, and fill the other attributes.
 
         On a running robot, `tracker` and `past` hold the state of the ticks before the last one.
-        With them, tracks and the task's own entries are computed only for the last tick.
+        With them, tracks and the task's own observation entries are only those of the last tick.
         """
         self._fill_numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
@@ -238,12 +238,12 @@ class Filling:
         signals, routing = self.signals, self.routing
         signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
         self._find_breaks()
-        before = np.arange(len(self.follows)) - self.follows  # the tick before, or itself
+        before = np.arange(len(self.follows)) - self.follows  # index of the tick before, or of this
         forward, lateral = localised_velocity(
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
         if lateral_by_poses is not None:
-            # Wheel and localised speed both come from the poses, so they never show slip.
+            # Wheel speeds come from the poses, so localised speeds must equal them: no slip.
             forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
         scanned = {name: signals[name] for name in SCANNED}
@@ -272,7 +272,7 @@ class Filling:
         return np.repeat(past.now(one), len(self.tick_ns), axis=0)
 
     def _tracks(self, signals: Signals, tracker: Tracker | None) -> Signals:
-        """Run the tracker over the ticks; it starts anew at a tick that does not follow."""
+        """Run the tracker over the ticks; it starts anew at a tick that follows no other."""
         count, one = len(self.tick_ns), np.array([0])
         ticks = range(count) if tracker is None else range(count - 1, count)
         tracker = tracker or Tracker(self.task)
@@ -353,7 +353,7 @@ class Filling:
         problems[bad & (problems == "")] = reason
 
     def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
-        """Mark ticks as invalid by their reasons (T,); "" marks nothing."""
+        """Mark ticks as unusable for these reasons (T,); a tick with "" is not marked."""
         for reason in sorted(set(reasons) - {""}):
             text = f"{name}: {reason}" if name else reason
             self._mark_invalid(reasons == reason, text, route=route)
@@ -367,9 +367,9 @@ class Filling:
     def _fill_numbers(
         self, name: str, instead: Mapping[str, F64] | None = None, /, **signal_of: str
     ) -> None:
-        """Convert fields of a required input to signals; a tick is 0 if its value is unusable.
+        """Set signals from fields of a required input; an unusable value becomes 0.
 
-        A message without an estimate is replaced by `instead`, if given, else it is a problem.
+        `instead` replaces values without an estimate; if it is None, their ticks are unusable.
         """
         latest = self._latest_required(name)
         for key, signal in signal_of.items():
@@ -450,10 +450,10 @@ class Filling:
         self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
 
     def _fill_scan(self, name: str, source: Input, sectors: F64) -> None:
-        """Lower `sectors` (T, K) to the clearance of one lidar; NaN there means not yet known."""
+        """Lower the clearances `sectors` (T, K) to those of one lidar; NaN is not yet known."""
         latest, count = self._latest_required(name), len(self.tick_ns)
         fields: Fields = self.inputs.topics[source.topic].fields
-        if SECTORS not in fields:  # whole scans, which the readers of recordings reduce
+        if SECTORS not in fields:  # the topic was read without its reduction
             fields = scan_reduction(self.task, source).apply(fields)
         if near := int(np.asarray(fields[CLOSE]).sum()):
             self.notes.append(
@@ -482,7 +482,7 @@ class Filling:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
         source = self.inputs.by_name.get("bumper")
         if source is not None:
-            if source.max_age_s is not None:  # otherwise it publishes only changes
+            if source.max_age_s is not None:  # with None, a bumper publishes only changes
                 self._latest_required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
             bumped = [
@@ -542,7 +542,7 @@ class Filling:
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
 
     def _fill_route_in_hindsight(self) -> None:
-        """Set goals and routes in hindsight; only their signals depend on later messages."""
+        """Set goals and routes in hindsight; no other signals depend on later messages."""
         xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
         at = np.flatnonzero(self.located)
         carried = np.zeros(len(self.tick_ns), np.bool_)
@@ -565,9 +565,9 @@ def _chunks(steps: int) -> Iterator[Ints]:
 def _with_earlier(
     signals: Signals, rows: Ints, before: Ints, count: int
 ) -> tuple[Signals, list[Signals]]:
-    """Return the signals of steps `rows` (n,), and those of the `count` steps before, last first.
+    """Return the signals of steps `rows` (n,), and of each of `count` steps before, newest first.
 
-    `before` (T,) is the index of the step before each step, or of the step itself if it is first.
+    `before` (T,) is the index of the step before, or of the step itself if it follows no other.
     """
     at = [rows]
     for _ in range(count):
@@ -589,10 +589,10 @@ def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
 
 @lru_cache(maxsize=1024)
 def parse_policy(text: str) -> tuple[str, str | None, float | None]:
-    """Parse name, version and probability of a policy from JSON with these keys, or a bare name.
+    """Parse a policy's name, version and probability; text that is not JSON is the name alone.
 
-    The keys are `policy`, `version` and `probability`. An invalid probability, such as -3, becomes
-    NaN.
+    The JSON's keys are `policy`, `version` and `probability`. An invalid probability, such as -3,
+    becomes NaN.
     """
     try:
         message = json.loads(text)
@@ -603,7 +603,7 @@ def parse_policy(text: str) -> tuple[str, str | None, float | None]:
     name, version, chance = (message.get(key) for key in ("policy", "version", "probability"))
     if chance is not None:
         is_number = isinstance(chance, int | float) and not isinstance(chance, bool)
-        # A float32 sum may be a little above 1.
+        # A probability that was summed in float32 may be a little above 1.
         chance = min(float(chance), 1.0) if is_number and 0 < chance < 1 + 1e-6 else nan
     return (
         "unknown" if name is None else str(name),

@@ -40,7 +40,7 @@ class Edges:
     """The transforms of a recording, grouped by topic and child frame, as topics for `align`."""
 
     topics: dict[str, TopicColumns]  # "/tf odom" -> the transforms in /tf whose child is odom
-    static: frozenset[str]  # names of those in `topics` that never age
+    static: frozenset[str]  # keys of `topics` whose transforms never age
     parents: dict[str, list[str]]  # frame -> every parent it ever has
     parent_changes: int = 0  # how often a frame is given another parent
 
@@ -159,7 +159,7 @@ class Placement:
         )
 
     def fill(self, rows: Any, other: Placement, order: Any) -> None:
-        """Set `rows` to the rows `order` of another placement."""
+        """Copy the rows `order` of another placement to `rows`."""
         for to, source in zip(self._parts(), other._parts(), strict=True):
             to[rows] = source[order]
 
@@ -175,7 +175,7 @@ class Placement:
 class _Transform:
     """A frame's transform to its parent at T times."""
 
-    row: Ints  # (T,) row of the edge's columns
+    row: Ints  # (T,) row of the transform in its topic of `Edges.topics`
     parent: Ints  # (T,) number of the parent frame; -1 if no transform is known
     fresh: NDArray[np.bool_]
     moving: NDArray[np.bool_]
@@ -225,7 +225,7 @@ class Tree:
     def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
         """Return the transforms between `frame` and the fixed frame at one time.
 
-        Each as topic, child frame, row in `edges.topics["TOPIC FRAME"]` and stamp (ns).
+        Each is (topic, child frame, row in `edges.topics["TOPIC FRAME"]`, stamp in ns).
         """
         transforms = self._hold_above(frame, time)
         parent = {
@@ -246,7 +246,7 @@ class Tree:
         ]
 
     def _hold_above(self, frame: str, times: Sequence[Ints]) -> dict[int, _Transform]:
-        """Return the transforms of this frame, the fixed frame and all above, by frame number."""
+        """Return frame number -> transform, for this frame, the fixed one and all above them."""
         children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
         return {self._number(child): self._hold(child, times) for child in children}
 
@@ -258,7 +258,7 @@ class Tree:
         up: list[int],
         other: list[int],
     ) -> None:
-        """Set the poses at the times `rows`, when the paths to the root are `up` and `other`."""
+        """Set the poses at times `rows`; `up` and `other` are both frames' paths to the root."""
         meet = next((frame for frame in up if frame in other), None)
         if meet is None:
             out.problem[rows] = self._describe_gap(up, other)
@@ -359,14 +359,14 @@ def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
 
 
 def _path_up(frame: int, parent: Mapping[int, int]) -> list[int]:
-    """Return the frames from this one up to the root; a loop ends before it repeats a frame."""
+    """Return the frames from this one up to the root; in a loop, stop before a frame repeats."""
     way = [frame]
     while way[-1] in parent and parent[way[-1]] not in way:
         way.append(parent[way[-1]])
     return way
 
 
-SCATTER_M = 0.05  # margin for noise between two poses, before a step counts as a jump
+SCATTER_M = 0.05  # two poses may be this much farther apart, due to noise, without a jump
 _CHUNK = 4096  # ticks processed at a time: bounds memory
 
 
@@ -412,7 +412,7 @@ def poses_along(tree: Tree) -> list[PoseSeries]:
 
 @dataclass(frozen=True)
 class Motion:
-    """Speeds at T ticks, in the body frame in the middle of each window."""
+    """Speeds at T ticks, in the body frame; each is that in the middle of a window of poses."""
 
     forward_mps: F64
     lateral_mps: F64
@@ -427,11 +427,11 @@ def motion_at(
     max_jump_m: float,
     fastest_mps: float = math.inf,
 ) -> Motion:
-    """Compute the motion at ticks (T,) from the poses in the `window_s` up to the latest of each.
+    """Compute the speeds at ticks (T,) from the `window_s` of poses up to each tick's latest pose.
 
-    A step between poses is a jump if it is longer than `max_jump_m`, or than a robot of
-    `fastest_mps` drives in the time of the step plus `window_s`. The extra time allows for jitter
-    of stamps, and for a robot that is faster than commanded.
+    A step between poses is a jump if it is longer than `max_jump_m`, or longer than a robot drives
+    at `fastest_mps` in the time of the step plus `window_s`. The extra time allows for jitter of
+    stamps, and for a robot that is faster than commanded.
     """
     count = len(tick_ns)
     out = Motion(np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, "", object))
@@ -455,7 +455,7 @@ def motion_at(
     jumped = ~few & (before[latest] > before[np.minimum(begin, len(poses) - 1)])
     out.problem[jumped] = f"a pose jump within {window_s:g} s"
     turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
-    heading = poses.yaw_rad[:1] + turned  # without the wrap
+    heading = poses.yaw_rad[:1] + turned  # continuous, not wrapped at pi
     usable = np.flatnonzero(~few & ~jumped)
     for start in range(0, len(usable), _CHUNK):
         rows = usable[start : start + _CHUNK]
@@ -466,7 +466,7 @@ def motion_at(
 def _fill(out: Motion, rows: Ints, poses: PoseSeries, heading: F64, begin: Ints, end: Ints) -> None:
     """Fit the slopes of poses `begin` to `end` (exclusive), and write them to these rows."""
     most = int((end - begin).max())
-    at = begin[:, None] + np.arange(most)  # (R, P)
+    at = begin[:, None] + np.arange(most)  # (R, P) the poses of each row
     inside: Bools = at < end[:, None]
     at = np.minimum(at, len(poses) - 1)
     weight = inside / inside.sum(axis=1, keepdims=True)

@@ -66,9 +66,9 @@ class Fixes:
     latitude_deg: F64
     longitude_deg: F64
     status: F64 | None = None  # below 0: no fix (sensor_msgs/NavSatStatus)
-    covariance_m2: F64 | None = None  # (N, 9) for east, north and up
+    covariance_m2: F64 | None = None  # (N, 9) matrix over east, north and up, row by row
     covariance_type: F64 | None = None  # 0: unknown
-    yaw_rad: F64 | None = None  # IMU's yaw at each fix, NaN: unknown. None: use the track
+    yaw_rad: F64 | None = None  # yaw by IMU at each fix (NaN: unknown); None: use the track
 
     def std_m(self) -> F64:
         """Return the larger standard deviation of east and north, (N,); NaN if not reported."""
@@ -106,7 +106,7 @@ class Fixes:
         max_std_m: float | None = None,
         track_m: float | None = None,
     ) -> FixedPoses:
-        """Convert the fixes to poses about an origin; None: the first usable fix."""
+        """Convert the fixes to poses relative to an origin, by default the first usable fix."""
         max_std_m, track_m = max_std_m or MAX_STD_M, track_m or TRACK_M
         problem = self.problems(max_std_m)
         x, y, yaw = np.full((3, len(problem)), np.nan)
@@ -181,9 +181,9 @@ def _earth_centred_m(latitude_deg: F64, longitude_deg: F64) -> F64:
 def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
     """Return the direction of the last `track_m` driven up to each position, (N,), in rad.
 
-    It points from the latest earlier position at that distance. If the robot has stayed nearer
-    since the direction was last found, that direction is held. NaN until the robot has driven
-    `track_m`. Positions are in order of time.
+    The direction is that from the latest earlier position at least `track_m` away. If there is none
+    since the position that gave the last direction, that direction is held. NaN until the robot has
+    driven `track_m`. Positions are in order of time.
     """
     # A robot that stands for an hour leaves an hour of near positions. Positions are therefore
     # searched block by block, and a block only if a corner of its bounding box is far enough.
@@ -239,7 +239,7 @@ class InputColumns:
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics, self.max_gap_s = topics, profile.clock.max_gap_s
         self.origin_m = np.array(profile.origin_m or (0.0, 0.0))  # origin of all positions
-        self.placed: dict[str, Placement] = {}  # inputs in another frame -> pose of it per message
+        self.placed: dict[str, Placement] = {}  # input in another frame -> that frame's poses
         self.by_name: dict[str, Input] = {  # inputs whose topic is in the recording
             name: source
             for name, source in profile.sources.items()
@@ -247,7 +247,7 @@ class InputColumns:
         }
 
     def column(self, name: str, key: str) -> FieldColumn:
-        """Return a field of an input as it was decoded."""
+        """Return a field of an input as decoded, without conversion to the unit of its key."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
@@ -295,7 +295,7 @@ class InputColumns:
         return np.asarray(found, np.float64)
 
     def no_estimate(self, name: str, key: str) -> Bools:
-        """Return which messages (N,) are marked as without an estimate of this field."""
+        """Return which messages (N,) are marked as having no estimate of this field."""
         source = self.by_name[name]
         columns = self.topics[source.topic]
         none = np.zeros(len(columns), np.bool_)
@@ -304,7 +304,7 @@ class InputColumns:
         return none
 
     def unestimated(self) -> Iterator[tuple[str, str, int, str]]:
-        """Yield inputs with messages without an estimate: name, field, count, and their marking."""
+        """Yield (input, field, number of messages without an estimate of it, how they say so)."""
         for name, source in self.by_name.items():
             columns = self.topics[source.topic]
             rules = (rule for path in source.fields.values() for rule in _marks(source, path))
@@ -318,7 +318,7 @@ class InputColumns:
 
     @cached_property
     def fixed(self) -> FixedPoses:
-        """Return the pose of each message of a pose by latitude and longitude."""
+        """Return the pose at each message of [inputs.pose], computed from satellite fixes."""
         source = self.by_name["pose"]
         columns, yaw = self.topics[source.topic], None
         if "heading" in self.by_name:
@@ -330,7 +330,7 @@ class InputColumns:
 
     @cached_property
     def reckoned(self) -> FixedPoses:
-        """Return the pose at each message of a pose by dead reckoning."""
+        """Return the pose at each message of [inputs.pose], computed by dead reckoning."""
         columns = self.topics[self.by_name["pose"].topic]
         speed, turn = (self.numbers("pose", key) for key in ("speed_mps", "yaw_rate_radps"))
         aside = np.zeros(len(speed))
@@ -399,9 +399,9 @@ class InputColumns:
 
 
 def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Reduction | None:
-    """Build the reduction that flags messages without an estimate of fields that inputs read.
+    """Build the reduction that flags messages without an estimate of a field that an input reads.
 
-    None if messages with these fields cannot be marked so.
+    None if messages with these `fields` cannot say that they have no estimate.
     """
     rules = list(
         dict.fromkeys(
@@ -426,7 +426,7 @@ def _marks(source: Input, path: str) -> list[Convention]:
 
 
 def _key(rule: Convention) -> str:
-    """Return the column of a convention's flags; its name has spaces, unlike those of fields."""
+    """Return the name of a column of flags; it has spaces, so as not to clash with fields."""
     return f"no estimate of {rule.values[0]}"
 
 
@@ -434,6 +434,6 @@ def _flags(columns: TopicColumns, rule: Convention) -> Bools:
     """Return which messages a convention marks, (N,); all False if they lack its fields."""
     if _key(rule) in columns.fields:
         return np.asarray(columns.fields[_key(rule)], np.bool_)
-    if set(rule.fields) <= columns.fields.keys():  # whole messages, which readers reduce
+    if set(rule.fields) <= columns.fields.keys():  # read without the reduction
         return rule.flags(columns.fields)
     return np.zeros(len(columns), np.bool_)

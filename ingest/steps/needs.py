@@ -47,8 +47,8 @@ from restock.ingest.task.tracks import Lidar
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
 
-NEARLY = 0.8  # similarity from which a topic may be a misspelling: /plan is not /scan
-MAX_LISTED = 20  # topics listed in an error, as a fleet's nightly ingest prints one per recording
+NEARLY = 0.8  # similarity above which a topic may be a misspelling; /plan and /scan are below
+MAX_LISTED = 20  # most topics in an error: a fleet's nightly ingest may print many such errors
 OTHER_FIELDS = (
     "correct the profile; if the messages changed with an update of the robot, ingest the "
     "recordings from before and after it with a profile each: a copy with the other field and "
@@ -62,9 +62,9 @@ def read_topics(
     """Read the columns that a profile needs of a recording.
 
     If header stamps run at another pace than log time, `/clock` is read too, as it gives the pace.
-    With `reduced`, scans become clearance, messages custom signals and images their layout, which
-    is all that steps need. Otherwise the needed fields are kept as recorded; but images are left
-    out, and clouds become scans.
+    With `reduced`, only what steps need is kept: clearance of scans, values of custom signals, and
+    layouts of images. Otherwise the needed fields are kept as recorded; but images are left out,
+    and clouds become scans.
 
     Raises:
         RecordingError: as `wanted_fields`; or a point cloud's frame does not move with the robot.
@@ -126,10 +126,10 @@ def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
 def wanted_fields(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> dict[str, list[str]]:
-    """Return topic -> field paths to keep for this profile, of the `available` topics.
+    """Return available topic -> field paths to keep for this profile.
 
-    Fields that only `reductions` read are not listed. Skipped topics are, as reading them counts
-    their messages as lost.
+    Fields that only `reductions` read are not listed. Skipped topics are listed, so that they are
+    read and their messages are counted as lost.
 
     Args:
         profile: the profile.
@@ -181,7 +181,7 @@ def wanted_fields(
 def reductions(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> dict[str, Reduction]:
-    """Return topic -> reduction of its messages as they are read.
+    """Return topic -> reduction that is applied to its messages while they are read.
 
     Reductions compute clearance, custom signals, layouts of images, and flags of messages without
     an estimate.
@@ -239,7 +239,7 @@ def input_problems(
     available: Mapping[str, Any],
     leaves: Mapping[str, Sequence[Leaf]] | None = None,
 ) -> list[str]:
-    """Return why a recording with these topics (and fields) does not fit the profile, by topic."""
+    """Return all reasons why a recording with these topics and fields does not fit the profile."""
     needed: dict[str, list[str]] = {}
     types: dict[str, str] = {}  # message type of each entry of `needed`
     wrong: dict[str, list[str]] = {}
@@ -279,9 +279,9 @@ def input_problems(
 
 
 def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
-    """Return a note for each optional input whose topic is missing, if another topic may be it.
+    """Return a note for each optional input whose topic is missing but may have another name.
 
-    That is an unused topic of the same type: the name may differ on one robot, or after an update.
+    An unused topic of the same type may be it: names differ between robots, or after an update.
     Types of std_msgs are not considered, as their messages may contain anything.
     """
     used = profile.topics
@@ -353,7 +353,7 @@ def _skipped(topic: str, available: Mapping[str, Any]) -> str:
     return f"{topic} is skipped, with {counted(info.expected, 'message')}: {info.skipped}"
 
 
-MAX_TRANSFORMS = 500  # messages searched per topic; a lidar's transform is published all the time
+MAX_TRANSFORMS = 500  # messages searched per topic; few suffice, as transforms are repeated
 
 
 def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
@@ -418,7 +418,7 @@ def _children(recording: Recording, topic: str) -> Iterator[str]:
             return
 
 
-# Columns computed from a scan. Their names have spaces, unlike names of the message's fields.
+# Names of columns computed from a scan. They have spaces, so as not to clash with field names.
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
 FINE = "nearest return of each fine sector"  # (N, FINE_SECTORS) float64, m; if the task has tracks
 BEAMS = "number of beams"  # (N,) int64
