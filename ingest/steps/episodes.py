@@ -51,7 +51,7 @@ class Steps:
     residual: F64  # (T,) distance of that action from the command, scaled as in `nearest_action`
     policy: list[str]  # (T,) name of the behaviour policy, which drives
     policy_version: list[str | None]  # (T,) the policy's version; None: unknown
-    probability: list[float | None]  # (T,) the policy's chance of choosing the action; None: unknown
+    probability: list[float | None]  # (T,) the policy's chance to choose the action; None: unknown
     truth: list[str | None]  # (T,) true conditions, if a simulator published them
     true_exposure: list[str | None]  # (T,) likewise for exposures
     perturbed: Perturbed  # (T,) a simulator's parameters in force

@@ -35,7 +35,7 @@ _REFUSED = {
 }
 _BRACKETS = "its brackets do not match"
 _UNBALANCED = f"{_BRACKETS}: a condition must be one expression over the steps"
-# DuckDB's built-in macros that depend only on their arguments; the others read session state.
+# DuckDB's macros that depend only on their arguments, by prefix and by name; others are refused.
 _MACROS = ("list_", "array_")
 _MORE_MACROS = {
     *("nullif", "if", "fmod", "fdiv", "split_part", "date_add", "days_in_month"),
@@ -50,10 +50,10 @@ _GROWING = {
 _MORE_ROWS = {"unnest", "unlist"}
 _UNARY = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
 _WINDOWED = {*_UNARY, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
-# Functions that use a time zone: it is an argument, or the session's, which is fixed here.
+# Functions that use a time zone but are repeatable, as it is an argument or fixed by our session.
 _ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
-# Aggregates that depend on the order of the rows; window functions do in any case.
+# Aggregates whose result depends on the order of rows. That of window functions always does.
 _ORDERED = {
     *("any_value", "arbitrary", "list", "array_agg"),
     *("string_agg", "group_concat", "listagg"),
@@ -75,11 +75,11 @@ SELECT = "SELECT {columns} FROM {source} " + WINDOW + " ORDER BY row_"
 def sandbox() -> duckdb.DuckDBPyConnection:
     """Return the one database in which all conditions run; each use opens a `cursor`.
 
-    Opening a database takes longer than labelling an episode.
+    It stays open, as opening a database takes longer than labelling an episode.
     """
     import duckdb
 
-    atexit.register(sandbox.cache_clear)  # nanobind warns about objects that outlive its module
+    atexit.register(sandbox.cache_clear)  # else nanobind warns that it outlives its module
     connection = duckdb.connect(config=SANDBOX)
     connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's time zone
     connection.execute("SET lock_configuration = true").fetchall()
@@ -118,7 +118,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
 
 
 def _is_own_query(node: dict[str, Any]) -> bool:
-    """Return whether the parsed query around the expression still is `SELECT`."""
+    """Return whether the parsed query is still `SELECT`: the expression added no clause to it."""
     source = node["from_table"]
     return (
         source["type"] == "BASE_TABLE"
@@ -145,7 +145,7 @@ def _walk(part: Any) -> Iterator[dict[str, Any]]:
 def _refuse(part: dict[str, Any], timing: str) -> str | None:
     kind = part["class"]
     if kind == "STAR" and not part["columns"]:
-        return None  # count(*); DuckDB refuses it anywhere else
+        return None  # the * of count(*); DuckDB refuses this kind anywhere else
     if kind in _REFUSED:
         return _REFUSED[kind]
     if kind == "FUNCTION" and part["function_name"].lower() in _GROWING:
@@ -277,7 +277,7 @@ def expression_problem(sql: str) -> str | None:
     """Return why this SQL is not one expression that can be put into brackets, or None."""
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
-        both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # as in `refusal`
+        both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # two kinds of brackets, as in `refusal`
         ((text, other),) = connection.execute(query, both).fetchall()
     parsed, in_square = json.loads(text), json.loads(other)
     if not in_square["error"]:
@@ -315,4 +315,4 @@ def _depends_on_order(window: dict[str, Any]) -> bool:
     if any(window[edge].endswith("_ROWS") for edge in ("start", "end")):
         return True
     ordered = window["type"] != "WINDOW_AGGREGATE" or window["function_name"].lower() in _ORDERED
-    return ordered and not window["arg_orders"]  # first(x ORDER BY y)
+    return ordered and not window["arg_orders"]  # first(x ORDER BY y) has an order of its own

@@ -78,10 +78,10 @@ if TYPE_CHECKING:  # slow to import, and not needed for conditions that are in t
 
 Timing = Literal["pre", "post"]
 Kind = Literal["outcome", "exposure"]
-Expression = Literal["sql", "probability"]  # of a condition
+Expression = Literal["sql", "probability"]  # the two expressions of a condition
 NOMINAL = "nominal"
 _LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
-# Time limit for all conditions of a recording. The shipped ones take 1/30 of the limit per step.
+# Time limit for all conditions of a recording. The shipped ones need 1/30 of LIMIT_S_PER_STEP.
 LIMIT_S, LIMIT_S_PER_STEP = 60.0, 0.001
 # Reasons why a condition is unknown.
 NO_LIDAR = "no lidar"
@@ -93,7 +93,7 @@ Columns = dict[tuple[str, Expression], Column]  # keys: the condition's name, an
 
 
 class Condition(Checked, frozen=True):
-    """A named label. A row's one condition is the label with the lowest priority number."""
+    """A named label. Of a row's labels, that with the lowest priority number is its condition."""
 
     name: str
     timing: Timing
@@ -102,8 +102,8 @@ class Condition(Checked, frozen=True):
     doc: str = ""
     let: dict[str, str] = msgspec.field(default_factory=dict)  # name -> SQL; may use earlier names
     probability: str = ""  # SQL with values from 0 to 1; "": the condition has no probability
-    uncertain: tuple[float, float] = (0.2, 0.8)  # probabilities that count as uncertain
-    constants: dict[str, float] = msgspec.field(default_factory=dict)  # for use in its SQL
+    uncertain: tuple[float, float] = (0.2, 0.8)  # range of probabilities that count as uncertain
+    constants: dict[str, float] = msgspec.field(default_factory=dict)  # name -> value for the SQL
     kind: Kind = "outcome"
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
@@ -148,7 +148,7 @@ class Condition(Checked, frozen=True):
 
 
 def in_steps(sql: str, constants: Mapping[str, float]) -> str:
-    """Replace times, and distances at the robot's highest speed, in SQL by steps, at least 1."""
+    """Replace `{1.6 s}`, and `{0.2 m}` at top speed, in SQL by a number of steps, at least 1."""
     period_s = constants["control_period_s"]
     a_step = {"s": period_s, "m": period_s * constants["fastest_mps"]}
     return _LENGTH.sub(lambda found: str(max(round(float(found[1]) / a_step[found[2]]), 1)), sql)
@@ -173,10 +173,10 @@ def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Conditio
 def signals_named(
     conditions: Iterable[Condition], signals: Collection[str] = LIDAR_SIGNALS
 ) -> dict[str, list[str]]:
-    """Return the conditions that name any of these signals, and the signals that each names.
+    """Return condition -> the `signals` that it names, without conditions that name none of them.
 
-    `signals` are unknown; by default they are those that need a lidar. A condition that names an
-    unknown signal is null at every step, whatever its SQL makes of a null.
+    `signals` are unknown in a recording; by default, they are those that need a lidar. A condition
+    that names one is null at every step, whatever its SQL makes of a null.
     """
     lost = {one.name: sorted(one.words & set(signals)) for one in conditions}
     return {name: named for name, named in lost.items() if named}
@@ -224,7 +224,7 @@ def labels_version(conditions: Sequence[Condition]) -> str:
     """Return a hash of a set of conditions, 12 hex digits."""
     definitions = [
         (c.name, c.timing, c.sql, c.priority)
-        # Optional settings are hashed only if used, so that the version of a plain rule stays.
+        # Optional settings are hashed only if used: a rule without them keeps its version.
         + ((c.probability, c.uncertain) if c.probability else ())
         + ((list(c.let.items()), sorted(c.constants.items())) if c.let or c.constants else ())
         + ((c.kind,) if c.kind != "outcome" else ())
@@ -287,7 +287,7 @@ def label_several(
             if other not in found and rules == conditions and table.schema == steps.schema
         ]
         if any("episode_index" in condition.words for condition in conditions):
-            alike = [place]  # a shared query renumbers the episodes
+            alike = [place]  # a shared query would renumber the episodes that they name
         parts, first = [], 0
         for table in (several[other][0] for other in alike):
             episodes = np.asarray(table["episode_index"]) + first
@@ -380,7 +380,7 @@ def _evaluate(
     expressions runs alone, so that the error names the condition.
     """
     requested = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
-    together: dict[str, list[tuple[Condition, Expression]]] = {}  # by FROM clause
+    together: dict[str, list[tuple[Condition, Expression]]] = {}  # FROM clause -> its expressions
     for condition, part in requested:
         _refuse(condition, part, steps.column_names)
         together.setdefault(_source(condition), []).append((condition, part))
@@ -501,7 +501,7 @@ def _query(
     )
     query = SELECT.format(columns=f"{columns},\nrow_", source=_source(requested[0][0]))
     with _interrupted_after(connection, limit_s):
-        found = connection.execute(query)  # `sql` would plan it twice
+        found = connection.execute(query)  # connection.sql() would plan the query twice
         kinds = [str(column[1]) for column in found.description]
         *values, row = found.fetchnumpy().values()
     if not np.array_equal(row, np.arange(count)):
@@ -520,7 +520,7 @@ def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) ->
     def interrupt() -> None:
         wait_s = limit_s
         while not done.wait(wait_s):
-            connection.interrupt()  # repeated, as it has no effect between two queries
+            connection.interrupt()  # repeated: between two queries, it has no effect
             wait_s = 0.1
 
     thread = threading.Thread(target=interrupt, daemon=True)
@@ -529,11 +529,11 @@ def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) ->
         yield
     finally:
         done.set()
-        thread.join()  # otherwise it could interrupt the next query
+        thread.join()  # a thread that still runs could interrupt the next query
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
-    """Return each row's one condition: the outcome of lowest priority number, or `nominal`."""
+    """Return one condition per row: its outcome with the lowest priority number, or `nominal`."""
     outcomes = of_kind(conditions, "outcome")
     ordered = sorted(outcomes, key=lambda condition: (condition.priority, condition.name))
     if not ordered:
@@ -558,7 +558,7 @@ def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
     return holds
 
 
-MAX_BYTES = 100_000  # of a condition's file
+MAX_BYTES = 100_000  # largest size of a condition's file
 _PART = re.compile(r"-- (?:let ([A-Za-z]\w*)|(label|probability)):\s*")
 _SETTINGS = ("kind", "timing", "priority", "uncertain")
 
@@ -624,7 +624,7 @@ def settings_of(text: str) -> dict[str, Any]:
 
 
 def _value(text: str) -> str | int | list[str | float]:
-    """Parse a whole number, `0.2 to 0.8`, or a word; the type check reports wrong types by key."""
+    """Parse a whole number, `0.2 to 0.8`, or a word; a later check reports wrong types."""
     if text.lstrip("-").isdigit():
         return int(text)
     if " to " not in text:
@@ -636,8 +636,8 @@ def _value(text: str) -> str | int | list[str | float]:
 def with_files(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
     """Replace each `[[condition]] file = "…"` of a profile's TOML by the settings in that file.
 
-    Settings in comments of the file, such as `-- timing: pre`, give way to keys in the TOML. The
-    file must be in the profile's folder, as profiles are passed between strangers.
+    Keys in the TOML override settings in comments of the file, such as `-- timing: pre`. The file
+    must be in the profile's folder, so that a stranger's profile cannot read other files.
 
     Raises:
         ConfigError: the file does not exist or is outside the folder; names the key.

@@ -25,13 +25,13 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.task import Task
 from restock.toml import Checked
 
-NO_MISSION = "goal: none in hindsight"  # drop reason of ticks without a mission
+NO_MISSION = "goal: none in hindsight"  # why ticks without a mission are dropped
 STANDING = f"{NO_MISSION}, standing still"
 NOWHERE = f"{NO_MISSION}, nowhere far enough"
 
 _SHORTEST = 3.0  # shortest distance from start to goal, in goal radii
-_WAIT_S = 10.0  # longest standing before the start that belongs to the mission
-_BACK = 0.6  # share of the farthest distance from the start below which the robot turned back
+_WAIT_S = 10.0  # a mission includes at most this much of the standing before its drive
+_BACK = 0.6  # below this share of its farthest distance from the start, the robot turned back
 _LIMIT = 0.9  # longest mission, as a share of the task's time limit
 
 GoalSource = Literal["logged", "hindsight"]
@@ -58,7 +58,7 @@ class Missions:
     goals_m: F64  # (M, 2)
     routes_m: list[F64]  # each (P, 2), from the mission's start to its goal
     ended_at: list[str]  # (M,) why the mission ends there
-    standing: Bools  # (T,) whether the robot stands still, except while a mission drives
+    standing: Bools  # (T,) whether the robot stands still; False during a mission's drive
     driven_m: float
     shortest_m: float
 
@@ -116,7 +116,7 @@ class _MissionCutter:
         self.leg = leg
         self.shortest_m = shortest_m(task)
         self.longest_s = _LIMIT * task.time_limit_steps * task.control_period_s
-        self.standing = self._standing()  # ticks of a mission are cleared as it is added
+        self.standing = self._standing()  # `_add` clears the ticks of each mission
         self.mission = np.full(len(xy_m), -1, np.int64)
         self.goals: list[F64] = []
         self.routes: list[F64] = []
@@ -139,18 +139,18 @@ class _MissionCutter:
         )
 
     def _cut_leg(self, first: int, last: int, end: str) -> None:
-        """Add the missions between the places where the robot stood still."""
+        """Add the missions of one leg, between the places where the robot stood still."""
         changes = np.flatnonzero(np.diff(self.standing[first : last + 1].astype(np.int8)))
         stood = first
         bounds = [first, *(changes + first + 1).tolist(), last + 1]
         for begin, stop in pairwise(bounds):
             if self.standing[begin]:
-                if self.mission[begin] >= 0:  # the reached goal stays in force while it stands
+                if self.mission[begin] >= 0:  # a reached goal stays in force at rest
                     self.mission[begin:stop] = self.mission[begin]
                 stood = begin + 1 if self.mission[begin] >= 0 else begin
                 continue
             arrives = stop <= last
-            # The time just before the robot set off is part of the drive: it turned to its way.
+            # The drive begins up to _WAIT_S before the robot sets off, as it may turn in place.
             since = np.searchsorted(self.at_s, self.at_s[begin] - _WAIT_S, "left")
             start = min(max(stood, int(since)), begin)
             self._cut_drive(start, stop if arrives else last, "stood still" if arrives else end)
@@ -187,7 +187,7 @@ class _MissionCutter:
         goal = self._place(self.xy_m[end])
         gap = np.hypot(*(self.xy_m[start : end + 1] - goal).T)
         arrival = start + int(np.flatnonzero(gap <= self.radius_m)[0])
-        if (gap[arrival - start :] > self.shortest_m).any():  # episodes end on arrival
+        if (gap[arrival - start :] > self.shortest_m).any():  # it left again: end at arrival
             end, why, last = arrival, "came back later", False
         number = len(self.goals)
         self.goals.append(goal)

@@ -73,7 +73,7 @@ class Robot(Checked, frozen=True):
     wheel_radius_m: Metres | None = None
     track_m: Metres | None = None  # distance between left and right wheels' contact points
     wheelbase_m: Metres | None = None  # distance between the axles, if there are two
-    # x of the axle (or the middle of two), ahead of the outline's middle; poses are the axle's.
+    # How far the axle (the middle of two) is ahead of the outline's middle. Poses are the axle's.
     axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     mass_kg: Annotated[float, Meta(gt=0, le=5000)] | None = None  # total, with wheels
     height_m: Metres | None = None
@@ -86,8 +86,8 @@ class Robot(Checked, frozen=True):
     # axle, and how fast the angle changes.
     max_steering_rad: Annotated[float, Meta(gt=0.01, le=1.4)] | None = None
     max_steering_rate_radps: Limit | None = None
-    # Wheel separation that controller and odometry assume, divided by the track: a skid-steer robot
-    # turns less than its wheels. None: the twin's own value.
+    # Wheel separation that controller and odometry assume, divided by track_m. It is above 1 if the
+    # robot turns less than its wheels suggest, like skid-steer robots. None: the twin's own value.
     track_ratio: Annotated[float, Meta(ge=0.5, le=10)] | None = None
     lidar: Lidar = Lidar()
     origin: dict[str, Origin] = msgspec.field(default_factory=dict)
@@ -112,7 +112,7 @@ class Robot(Checked, frozen=True):
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Return the radius of the pose's circle at full steering; 0 if it can turn in place."""
+        """Return the radius of the axle's circle at full steering; 0 if it can turn in place."""
         if self.drive != "ackermann" or self.wheelbase_m is None:
             return 0.0
         return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)
@@ -171,12 +171,12 @@ RULES = ("none", "speed", "acceleration", "slow", "stop", "unknown")
 NONE, SPEED, ACCELERATION, SLOW, STOP, UNKNOWN = range(6)
 STANDSTILL_S = 1.0  # time to brake from the fastest action, if no braking limit is known
 CREEP_MPS = 0.02  # speed of the outline's fastest point below which the command is a stop
-_STEP_M = 0.025  # distance of the outline's fastest point between two places checked on the arc
+_STEP_M = 0.025  # the arc is checked each time that the outline's fastest point moves this far
 _TOUCH_M = 1e-6
 
 
 class Limiter(Checked, frozen=True):
-    """The `[limiter]` of a profile; None is derived from outline, actions and control period."""
+    """The `[limiter]` of a profile; a None is derived from outline, actions and control period."""
 
     stop_m: Annotated[float, Meta(ge=0, le=10)] | None = None  # room to keep; None: .2 of the width
     reaction_s: Annotated[float, Meta(ge=0, le=5)] | None = None  # None: two control periods
@@ -199,7 +199,7 @@ class Limits:
     accel: tuple[float, float]  # m/s2, rad/s2; inf: no limit
     period_s: float
     body: Body
-    axle_x_m: float  # turning point ahead of the outline's middle
+    axle_x_m: float  # how far the turning point is ahead of the outline's middle
     sectors: int
 
     @classmethod
@@ -220,7 +220,7 @@ class Limits:
         return cls(
             stop_m=0.2 * task.body.width_m if given.stop_m is None else given.stop_m,
             reaction_s=2 * period_s if given.reaction_s is None else given.reaction_s,
-            brake=(max(brake[0], 1e-3), max(brake[1], 1e-3)),  # 0 if no action drives, or turns
+            brake=(max(brake[0], 1e-3), max(brake[1], 1e-3)),  # not 0 if no action drives, or turns
             fastest=fastest,
             accel=(
                 given.max_accel_mps2 or accel[0] or np.inf,
@@ -288,7 +288,7 @@ def limit(
 
     within = np.clip(command, -np.array(limits.fastest), limits.fastest)
     command, rule = _lower(command, within, rule, SPEED)
-    before = np.where(blind[:, None], 0.0, previous) * np.sign(command)  # in proposed direction
+    before = np.where(blind[:, None], 0.0, previous) * np.sign(command)  # > 0: along the command
     most = np.maximum(before + np.array(limits.accel) * limits.period_s, 0.0)
     command, rule = _lower(command, np.clip(command, -most, most), rule, ACCELERATION)
 
@@ -308,7 +308,7 @@ def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
     factor = np.ones(len(command))
     if not limits.sectors:
         return factor
-    rate = np.abs(command[:, 0]) + np.abs(command[:, 1]) * limits.reach_m  # m/s of the outline
+    rate = np.abs(command[:, 0]) + np.abs(command[:, 1]) * limits.reach_m  # m/s, fastest point
     near = clearance_m.min(axis=1) < limits.way_m
     ids = np.flatnonzero((rate > 1e-6) & near)
     if not len(ids):
@@ -317,7 +317,7 @@ def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
     free_m = free_way(limits, command[ids] / rate[:, None], clearance_m[ids])
     room_s = np.maximum(free_m - limits.stop_m, 0.0) / np.maximum(rate, CREEP_MPS)
     stand_s = (np.abs(command[ids]) / np.array(limits.brake)).max(axis=1)
-    # reaction f + stand / 2 f^2 = room, solved for f.
+    # Solve reaction * f + stand / 2 * f^2 = room, all in seconds, for the factor f.
     reaction = limits.reaction_s
     f = 2 * room_s / (reaction + np.sqrt(reaction**2 + 2 * stand_s * room_s) + 1e-12)
     f = np.minimum(f, 1.0)
@@ -334,7 +334,7 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
     it reaches beyond the return on the same bearing: space behind a return counts as occupied.
 
     Args:
-        direction: (N, 2) m ahead and rad of turn per metre of that point.
+        direction: (N, 2) m ahead and rad of turn, per metre that the fastest point travels.
         clearance_m: (N, K).
     """
     free = np.zeros(len(direction))
@@ -359,7 +359,7 @@ def _swept(limits: Limits, ahead: float, turn: float) -> F64:
     bearing: F64 = (np.arange(count, dtype=np.float64) + 0.5) * (2 * np.pi / count) - np.pi
     way_m = np.arange(0.0, limits.way_m + _STEP_M, _STEP_M)
     turned = turn * way_m
-    x, y = ahead * way_m * _sinc(turned), ahead * way_m * _cosc(turned)  # of the turning point
+    x, y = ahead * way_m * _sinc(turned), ahead * way_m * _cosc(turned)  # turning point
     # The lidar's position and beams at the start, in the frame of the outline at each step.
     lidar_x, cos, sin = body.lidar_x_m - limits.axle_x_m, np.cos(turned), np.sin(turned)
     from_x = (cos * (lidar_x - x) - sin * y + limits.axle_x_m)[:, None]

@@ -25,7 +25,7 @@ GOLDEN = 0x9E3779B97F4A7C15  # 2**64 / golden ratio: the increment of splitmix64
 
 
 def transition_ids(recording_id: str, tick: Ints) -> Ints:
-    """Return the transition ids (N,) of ticks of a recording's control clock (N,), from 0."""
+    """Return the transition ids (N,) of a recording's ticks (N,), which are numbered from 0."""
     number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
     return (number << STEP_BITS) + tick
 
@@ -40,7 +40,7 @@ def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table. The task sets the length of observations."""
+    """A column of a table. Its type leaves out the length of observations, which tasks define."""
 
     name: str
     type: pa.DataType
@@ -139,7 +139,7 @@ PROVENANCE: tuple[Column, ...] = (
 
 
 _TYPES = {"int64": pa.int64(), "bool": pa.bool_()}
-# float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
+# Numbers are float32, which resolves 1 mm up to 16 km from the map's origin; stamps are int64.
 SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
     Column(one.name, _TYPES.get(one.dtype, pa.float32()), one.meaning, nullable=one.optional)
     for one in STORED_SIGNALS

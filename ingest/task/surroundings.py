@@ -86,7 +86,7 @@ class MovedMap:
 
     sectors: int
     body: Body
-    from_m: tuple[float, float]  # position of this lidar ahead and left of the body's
+    from_m: tuple[float, float]  # how far this lidar is ahead and left of the body's lidar position
     ways: NDArray[np.float64]  # (2, B) cosines and sines of the beams, in the body's frame
 
     @classmethod
@@ -199,7 +199,7 @@ def view_route(
     cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
     if native.IS_USED:
         return _view_compiled(plans_m, pose_x_m, pose_y_m, cos, sin, distances_m)
-    # Coordinate by coordinate on contiguous arrays: this runs at every step of the twin.
+    # x and y are separate, contiguous arrays for speed: this runs at every step of the twin.
     x, y = np.ascontiguousarray(plans_m[..., 0]), np.ascontiguousarray(plans_m[..., 1])  # (N, P)
     start_x, start_y = x[:, :-1], y[:, :-1]
     step_x, step_y = x[:, 1:] - start_x, y[:, 1:] - start_y
@@ -213,7 +213,7 @@ def view_route(
     along = np.minimum(np.maximum(along, 0.0), 1.0)
     gap_x, gap_y = off_x - along * step_x, off_y - along * step_y
     distance2 = gap_x * gap_x + gap_y * gap_y
-    # If a plan passes the robot twice, the first pass counts, whatever the rounding of the two.
+    # If a plan passes the robot twice, equally near but for rounding, take the first pass.
     least = distance2.min(axis=1, keepdims=True)
     nearest = np.argmax(distance2 <= least + ROUNDING * (least + 0.1), axis=1)  # (N,), the first
     rows = np.arange(len(plans_m))
@@ -258,8 +258,8 @@ def _view_compiled(
 NEAR_M = 2.0  # largest clearance at which `came_nearer` looks for approaches
 REMEMBERED_S = 1.0  # a return that was there within this time has not come nearer
 FASTEST_MPS = 2.0  # fastest walk: a return that approaches faster was hidden before
-MIN_S = 0.25  # shortest time to compute a walk over: a lidar may be slower than the steps
-PLAN_PARTS = 3  # points per stretch of plan: to the near waypoint, and from it to the far one
+MIN_S = 0.25  # shortest time assumed between two scans: a lidar may be slower than the steps
+PLAN_PARTS = 3  # points per stretch of a plan: robot to near waypoint, near to far waypoint
 GAP_WITHIN = 1.4  # length of the plan just ahead, in units of `near_m`
 MOTION = (*("stamp_ns", "gyro_yaw_rate_radps"), *("localised_speed_mps", "localised_lateral_mps"))
 SCANNED = (*MOTION, "sector_clearance_m")  # signals that `came_nearer` needs
@@ -272,12 +272,12 @@ def steps_remembered(task: Task) -> int:
 
 
 def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
-    """Return how far (m) something came nearer since the step before, (N,); 0 if nothing did.
+    """Return how much nearer (m) something is than at every earlier step, (N,); 0 if nothing is.
 
     Each current return within NEAR_M is moved into the robot's frame at each earlier step, by the
-    localised speed and the gyroscope. It has come nearer if, at all these steps, the lidar saw
-    farther in the return's sector and both sectors beside it; the smallest of these differences is
-    how far. So an edge that a beam hits only sometimes does not count. Neither does something that
+    localised speed and the gyroscope. The return came nearer if, at all these steps, the lidar saw
+    farther in its sector and both sectors beside it; the result is the smallest of the differences.
+    So an edge that a beam hits only sometimes does not count. Neither does something that
     appears from behind a corner, as it is nearer by more than anybody walks. A step at which no
     beam of the three sectors returned shows nothing, and the return does not count. NaN without a
     lidar.
@@ -341,7 +341,7 @@ def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked
 def _motions(scans: Sequence[Signals]) -> F64:
     """Return the transform from each step's body frame to that of the step before, newest first.
 
-    As x, y, cosine and sine of the turn, (steps - 1, 4, N).
+    Each is x, y, cosine and sine of the turn: (steps - 1, 4, N).
     """
     stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in MOTION)
     elapsed_s = (stamp_ns[:-1] - stamp_ns[1:]) * 1e-9
@@ -395,7 +395,7 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         return way_m, gap_m
     range_m, range2, on_plan2, ahead_m = limits
     off2 = np.full(clearance_m.shape, np.inf)  # squared distance of each return from the plan
-    along_m = np.zeros(clearance_m.shape)  # distance along the plan to its point nearest to it
+    along_m = np.zeros(clearance_m.shape)  # distance along the plan to its point nearest a return
     passed = np.zeros((len(none), 1))
     for begin, end in pairwise(np.moveaxis(plan_m, 1, 0)):
         line_x, line_y = (end - begin)[:, :1], (end - begin)[:, 1:]
@@ -421,7 +421,7 @@ def sector_returns(task: Task, clearance_m: F64) -> tuple[F64, F64]:
 
 
 class _Sectors(NamedTuple):
-    cos: F64  # (K,) of the middle bearing
+    cos: F64  # (K,) cosine of each sector's middle bearing
     sin: F64
     reach_m: F64  # (K,) extent of the body in that direction
     ends: F64  # (K - 1,) end of each sector but the last, as `_turned` values
@@ -441,7 +441,7 @@ def _sectors(count: int, body: Body) -> _Sectors:
 
 
 def _turned(x: F64, y: F64) -> F64:
-    """Return a value that grows with the bearing of points, from -2 behind the robot to 2.
+    """Return a value that grows with the bearing of points: -2 at -pi, 0 ahead, and 2 at pi.
 
     Unlike an arctangent, it is rounded the same on every machine.
     """

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.toml import Checked
 
-Signals = dict[str, NDArray[Any]]  # by name; the leading axis is the step, or the environment
+Signals = dict[str, NDArray[Any]]  # name -> values, (steps, …) or (environments, …)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ SIGNALS: tuple[Signal, ...] = (
 TRACK_SIGNALS = ("track_x_m", "track_y_m", "track_vx_mps", "track_vy_mps", "track_age_s")
 
 OBSERVED: Final = "observed"  # key of the task's own observation entries, see `task_sql.py`
-OWN_LIMIT = 20.0  # own entries are clipped to +- this
+OWN_LIMIT = 20.0  # the task's own observation entries are clipped to +- this
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
@@ -124,7 +124,7 @@ def localised_velocity(
     elapsed_s = np.where(fresh, elapsed_s, 1.0)
     vx = (now["pose_x_m"] - before["pose_x_m"]) / elapsed_s
     vy = (now["pose_y_m"] - before["pose_y_m"]) / elapsed_s
-    # The heading half-way between the poses: a turn in place must not read as sideways motion.
+    # Use the heading half-way between the poses: a turn must not read as sideways motion.
     turn = wrap_angle(now["pose_yaw_rad"] - before["pose_yaw_rad"])
     heading = now["pose_yaw_rad"] - turn / 2
     cos, sin = np.cos(heading), np.sin(heading)
@@ -185,7 +185,7 @@ class Body(Checked, frozen=True):
 TASK_CODE_VERSION = 2
 
 MAX_PERIOD_S = 10.0
-SLIP_MPS = 0.15  # wheel minus ground speed that is slip, for a robot that drives 1 m/s or faster
+SLIP_MPS = 0.15  # slip is a larger difference to ground speed, at a top speed of 1 m/s or more
 
 
 class Rewards(Checked, frozen=True):
@@ -217,7 +217,7 @@ class Task(Checked, frozen=True):
     far_m: Annotated[float, Meta(gt=0)] = 2.2
     goal_radius_m: Annotated[float, Meta(gt=0)] = 0.4
     time_limit_steps: Annotated[int, Meta(ge=1)] = 240
-    # Number of tracks observed, nearest first. Unset: none, and the task's hash is as without it.
+    # Number of tracks in the observation, nearest first. Unset: none, and not in the task's hash.
     tracks: Annotated[int, Meta(ge=1, le=16)] | msgspec.UnsetType = msgspec.UNSET
     bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
@@ -362,7 +362,7 @@ class Mirror:
         at = names.index("previous_action_0")
         source[at : at + len(table)] = at + opposite
         at += len(table)
-        for begin in (at, at + task.sectors):  # clearance and closing, from behind right to left
+        for begin in (at, at + task.sectors):  # reverse the sectors of clearance and closing
             source[begin : begin + task.sectors] = source[begin : begin + task.sectors][::-1]
         odd = [name in _ODD or name.startswith(("track_y", "track_vy")) for name in names]
         sign = np.where(odd, -1.0, 1.0).astype(np.float32)
@@ -416,7 +416,7 @@ def nearest_action(
 ) -> tuple[Ints, NDArray[np.float64]]:
     """Return the discrete action nearest to each command, (N,), and its distance (N,).
 
-    Each axis is scaled by the fastest action on it. Ties go to the first action.
+    Speed and yaw rate are divided by their largest values among the actions. Ties go to the first.
     """
     command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / _fastest(task.actions)
     distance = np.linalg.norm(command[:, None, :] - task.scaled_actions[None], axis=-1)

@@ -107,8 +107,8 @@ def observed_in_log(
 ) -> F32:
     """Return the task's own observation entries (T, E) at each tick of a recording.
 
-    `follows` (T,) is whether a tick continues the run of the tick before. With `at` (n,), return
-    the entries (n, E) at these ticks only, and use `now` (n,) there in place of `signals`.
+    `follows` (T,) is whether a tick directly follows the one before. With `at` (n,), return the
+    entries (n, E) at these ticks only, and use `now` (n,) in place of `signals` at them.
     """
     run = np.cumsum(~follows, dtype=np.int64)
     if at is None:
@@ -144,7 +144,7 @@ def _steps_table(columns: Signals, episode: Ints, step: Ints) -> pa.Table:
 
 
 class Past(Stateful):
-    """The last steps of N robots: as many as the SQL of a table looks back on.
+    """The last steps of N robots, as many as the SQL of a table looks back.
 
     Raises:
         ConfigError: the SQL names a column that `who` does not fill, such as a profile's

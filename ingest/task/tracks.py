@@ -28,21 +28,21 @@ from restock.ingest.task.task import TRACK_SIGNALS, Signals, Task
 from restock.state import Stateful
 
 SECTORS = 240  # sectors of bearing, 1.5 degrees each; the nearest return of each is kept
-AROUND = 3  # sectors to either side that a place is compared with: two beams of 5 degrees
+AROUND = 3  # a place is compared with this many sectors to either side (two beams of 5 degrees)
 RANGE_M = 5.0  # nothing farther is tracked
 LAGS_S = (0.4, 1.0)  # ages of the earlier scans that a return is compared with
 FREE_M = 0.25  # a place was free if an earlier scan saw farther by more than this
 SAME_M = 0.2  # largest distance from an earlier return of the same object
 APART_M = 0.35  # largest gap between returns of one object, beyond the spacing of the beams
-LEFT_M, SMALL_M = 0.9, 1.0  # limits for people who walk away: distance to the place left, width
+LEFT_M, SMALL_M = 0.9, 1.0  # who walks away is this near to the place left, and this narrow
 WIDEST_M = 3.0  # widest detection; wider ones are walls or errors of the odometry
 INSIDE_M = 0.2  # distance from a person's visible side to their middle
-MANY = 0.5  # share of a scan's returns; if more move, the odometry is wrong
+MANY = 0.5  # if more than this share of a scan's returns moves, the odometry is wrong
 ACCEL_MPS2 = 1.0  # standard deviation of people's acceleration
 SPEED_MPS = 1.0  # standard deviation of a new track's speed
 FASTEST_MPS = 3.0
 GATE_M, WIDEST_GATE_M = 0.4, 1.0
-CONFIRM_SCANS, CONFIRM_S, CONFIRM_M = 3, 0.4, 0.25  # scans seen moving, age and way to confirm it
+CONFIRM_SCANS, CONFIRM_S, CONFIRM_M = 3, 0.4, 0.25  # scans in motion, age, way that confirm a track
 HIDDEN_S, LOST_S = 0.5, 0.8  # time unseen after which a track is not reported, and dropped
 STANDING_S = 3.0  # time without motion after which a track is dropped
 STANDING_MPS = 0.3  # a track that is faster, and not static, counts as moving
@@ -102,13 +102,13 @@ class _Detections:
     """D detected objects, in the odometry frame."""
 
     robot: Ints  # (D,)
-    x_m: F64  # (D,) middle of the object: that of its returns, moved INSIDE_M farther away
+    x_m: F64  # (D,) middle of the object: the mean of its returns, moved INSIDE_M farther away
     y_m: F64
     along_x: F64  # (D,) unit vector of the line of sight
     along_y: F64
     across_m: F64  # (D,) standard deviation of the position across the line of sight
     moving: Ints  # (D,) number of returns that move
-    still: Bools  # (D,) whether made of static returns
+    still: Bools  # (D,) whether the object consists of static returns
 
     def at(self, of: Bools) -> _Detections:
         """Select detections by a mask (D,)."""
@@ -225,7 +225,7 @@ class Tracker(Stateful):
         spacing = np.full(len(robot), SECTORS)
         apart = np.where(robot[1:] == robot[:-1], sector[1:] - sector[:-1], SECTORS)
         spacing[1:], spacing[:-1] = apart, np.minimum(spacing[:-1], apart)
-        spacing = np.minimum(spacing, SECTORS // 45)  # a wider gap is beams without a return
+        spacing = np.minimum(spacing, SECTORS // 45)  # wider gaps hold missing returns
         apart_m = APART_M + spacing * _WIDTH_RAD * distance
         joined = np.zeros(len(robot), np.bool_)
         joined[1:] = kept[1:] & kept[:-1] & (robot[1:] == robot[:-1])
@@ -249,7 +249,7 @@ class Tracker(Stateful):
         along_x, along_y = along_x / away, along_y / away
         few = wide < WIDEST_M
         moves = np.add.reduceat(moving.astype(np.int64), starts)
-        if (moves == 0).any():  # it may be walking away: then the place that it left is free now
+        if (moves == 0).any():  # if such an object walks away, the place it left is free now
             left = self._vacated(low, seen_from, fresh)
             from_it = np.hypot(middle_x[:, None] - left[:, 1], middle_y[:, None] - left[:, 2])
             near = (from_it < LEFT_M) & (of[:, None] == left[:, 0])
@@ -272,9 +272,9 @@ class Tracker(Stateful):
     def _seen(
         self, robot: Ints, x: F64, y: F64, low: F64, high: F64, seen_from: F64
     ) -> tuple[F64, F64, F64]:
-        """Return the nearest and farthest return of scans toward places, and the places' distance.
+        """Return a scan's nearest and farthest return toward each place, and the place's distance.
 
-        Each (P,), for places (P,) in the odometry frame.
+        Each is (P,), for places (P,) in the odometry frame.
         """
         cos, sin = np.cos(seen_from[:, 2])[robot], np.sin(seen_from[:, 2])[robot]
         off_x, off_y = x - seen_from[robot, 0], y - seen_from[robot, 1]
@@ -326,7 +326,7 @@ class Tracker(Stateful):
             rows, things = np.array(pairs).T
             self._correct(rows, found, things)
         self._correct_standing(sorted(set(range(len(tracks))) - taken), still, seen_from)
-        # Other detections near a track are part of the same object, and start no track.
+        # Unmatched detections near a track are part of its object, and start no track.
         free = np.ones(len(found.robot), np.bool_)
         free[sorted(used)] = False
         if len(tracks):
@@ -362,7 +362,7 @@ class Tracker(Stateful):
         tracks[rows, _MISSED] = 0.0
         moves = found.moving[things] > 0
         tracks[rows[moves], _HITS] += 1
-        # Someone who walks away is always at a place that earlier scans could not see.
+        # Someone who walks away is never seen at a place that was free: speed is motion, too.
         moves |= ~found.still[things] & (np.hypot(speed_x, speed_y) > STANDING_MPS)
         tracks[rows[moves], _STILL] = 0.0
 
