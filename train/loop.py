@@ -122,7 +122,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
-    _evaluate_if_due(session, notify, stop)  # due here if the run was stopped during one
+    _evaluate_if_due(session, notify, stop)  # due if an evaluation was interrupted
     while progress.env_steps < schedule.env_steps and time_left(session):
         _stop_if_requested(session, stop)
         # 2. Warm-up: the policy learnt from the logs drives, but no updates are made yet.
@@ -451,7 +451,7 @@ def _save(session: Session) -> None:
 
 
 def time_left(session: Session, part: float = 1.0) -> bool:
-    """Return whether the first `part` of the budget in seconds leaves time besides an evaluation.
+    """Return whether the first `part` of the budget in seconds leaves time besides evaluating.
 
     The budget covers all that a user waits for: cloning, updates on the logs, driving, evaluations.
     It is not checked in the first interval of updates, so that there is something to report.

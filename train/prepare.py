@@ -115,7 +115,7 @@ class Prepared:
         return session
 
     def _run(self) -> Run:
-        """Create the run's directory; or clear a resumed one of a stopped process's leftovers."""
+        """Create the run's directory; in a resumed run's, remove what a stopped process left."""
         if self.resumed is None:
             return Run.create(self.path, self.document)
         self.resumed.remove_leftovers()
@@ -237,7 +237,7 @@ def prepare_new(
     config = resolve_config(config, panel)
     check_new_run(config, profile.task, panel)
     requested = None
-    if config.teacher.source != GIVEN:  # created here only, as it may be large
+    if config.teacher.source != GIVEN:  # not created again later, as it may be large
         requested = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
     return Prepared(out, config, profile, panel, written, requested=requested)

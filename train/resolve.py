@@ -46,7 +46,7 @@ ASSUMED_STEPS_PER_S = 800.0  # environment steps per second, assumed until the s
 
 
 def planned_env_steps(config: TrainConfig) -> int:
-    """Return how many environment steps a budget allows; one in seconds, at the assumed speed."""
+    """Return how many environment steps the budget allows; seconds count at an assumed speed."""
     schedule = config.schedule
     if schedule.seconds is None:
         return schedule.env_steps

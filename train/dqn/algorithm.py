@@ -141,7 +141,7 @@ class DQN:
     def gradient(
         self, q: F32, scalars: F32, next_value: F32, weight: F32 | None
     ) -> tuple[Loss, F32]:
-        """Return the loss without penalty, and its gradient by `q` (B, A), bit for bit autograd's.
+        """Return the loss without penalty and its gradient by `q` (B, A), bit for bit as autograd.
 
         `scalars` (B, 3) has the columns action, reward and discount. `next_value` (B,) is the value
         of the next action, `weight` (B,) has importance weights; None: ones.
@@ -259,7 +259,7 @@ def dqn_loss(
 
     `weight` (B,) are importance weights that correct the sampling; None: ones.
     """
-    chosen = q.gather(1, action.unsqueeze(1))  # kept as (B, 1): saves the backward pass operations
+    chosen = q.gather(1, action.unsqueeze(1))  # (B, 1): squeezing it slows the backward pass
     wanted = target.unsqueeze(1)
     if weight is None:
         value = functional.huber_loss(chosen, wanted, delta=huber_delta)

@@ -46,7 +46,7 @@ Values = QNetwork | Ensemble
 UNKNOWN = -1  # code of the action if the teacher was not queried or had no opinion
 HIDDEN = (256, 256)  # widths of the behaviour network's layers
 _LEARNING_RATE = 1e-3
-_SEED = 1 << 32  # added to the run's seed, so that no Q network is initialised with the sum
+_SEED = 1 << 32  # added to the run's seed: the sum is larger than any seed of a Q network
 
 
 @dataclass(frozen=True)

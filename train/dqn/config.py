@@ -48,7 +48,7 @@ class NetworkConfig(Checked, frozen=True):
 class LossConfig(Checked, frozen=True):
     algorithm: str = "dqn"  # or your own, as module:name; docs/extending.md
     discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must equal the panel's
-    n_step: Count = 3  # of fresh rows; logged rows keep the n_step of their panel
+    n_step: Count = 3  # steps per return of fresh rows; logged rows keep the panel's
     double: bool = True
     huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
     # Weight of the CQL term on logged rows while offline; online it falls linearly to 0.
@@ -125,7 +125,7 @@ class TeacherConfig(Checked, frozen=True):
     # is larger by more than `margin`. "logs": only the cloned rows. "none". Or your own teacher, as
     # module:name. None: "operator" if the task has a goal, else "none".
     source: str | None = None
-    margin: NonNegative = 0.2  # by how much Q of another action must exceed Q of the proposal
+    margin: NonNegative = 0.2  # another action is taken if its Q exceeds the proposal's by more
     ratio: Share = 0.3  # an action is plausible if G(a|s) >= ratio * max G
     policies: tuple[str, ...] = ("operator",)  # drivers to clone, and to apply loss.margin to
     # Also clone episodes that reached their goal and that no driver of `policies` drove: until the
@@ -133,7 +133,7 @@ class TeacherConfig(Checked, frozen=True):
     # None: true if goals are logged and no teacher is queried in the twin.
     successes: bool | None = None
     # Updates of the behaviour network on cloned rows, before the critic's first update.
-    # None: `schedule.offline_updates`, times (cloned rows / 5,000) limited to 1 to 10.
+    # None: `schedule.offline_updates`, times cloned rows / 5,000 (at least 1, at most 10).
     offline_updates: NonNegativeInt | None = None
     # Mirror half of the behaviour network's rows, left to right. This suits only a teacher without
     # a preferred side. None: true if the twin's operator teaches and each action has its opposite.
@@ -161,7 +161,7 @@ class TeacherConfig(Checked, frozen=True):
 class EnvConfig(Checked, frozen=True):
     twin: bool = True  # false: train on logs alone, keep the last policy
     num_envs: Count = 32
-    # Shares of the twin's episodes by condition: by the kind of mission that the twin sets up.
+    # Relative shares of the twin's episodes by condition, which is the kind of mission.
     conditions: dict[str, NonNegative] = msgspec.field(
         default_factory=lambda: dict(DEFAULT_CONDITIONS)
     )
@@ -238,7 +238,7 @@ def has_effect(config: TrainConfig, key: str) -> bool:
 
 
 def refuse_untaught(config: TrainConfig, *, within: str = "") -> None:
-    """Raise ConfigError if a given setting of the teacher has no effect with its source."""
+    """Raise ConfigError if the config sets a key of the teacher that its source does not use."""
     source = config.teacher.source
     given = changed(config.teacher, source=source)
     if idle := [key for key in given if not has_effect(config, key)]:
@@ -329,7 +329,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text  # a bare word is a string
     *sections, last = key.strip().split(".")
-    if sections == ["target"]:  # the default rule, unless a rule is given
+    if sections == ["target"]:  # a key of the default rule, if no rule is given
         document.setdefault("target", {"rule": msgspec.to_builtins(TrainConfig().target)["rule"]})
     for section in sections:
         document = document.setdefault(section, {})

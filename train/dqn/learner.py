@@ -98,7 +98,7 @@ class Learner(Stateful):
         self._slow = FlatParameters(self.target_network, learns=False).values
         self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
         learns = self.optimizer
-        # Both networks as the loss calls them, replaced by kernels if there are any.
+        # What the loss calls: the networks, or compiled kernels in their place.
         self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
         self._target = differentiable(self.path, self.target_network, self._slow)
         self._has_kernels = type(self.algorithm) is DQN and type(self._online) is Kernel

@@ -221,7 +221,7 @@ class Kernel:
         return out
 
     def descend(self, gradient: F32) -> None:
-        """Compute the parameters' gradient from that of the last pass's first B rows of values."""
+        """Backpropagate `gradient` (B, A), that of the last forward pass's first B rows."""
         self._network.backward(gradient)
 
     def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:

@@ -56,7 +56,7 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-# Most fresh rows held back for labels; beyond that, the oldest interval is written unlabelled.
+# Most fresh rows held back for labels; if there are more, the oldest interval is written as it is.
 _MAX_HELD = 1 << 21
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
@@ -140,7 +140,7 @@ class FeedRecord(Stateful):
         *,
         tail: Tensor | None = None,
     ) -> None:
-        """Keep the batch of gradient step `step` (from 1), and audit it if the sample chooses it.
+        """Keep the batch of gradient step `step` (from 1); of a random share of batches, audit it.
 
         This runs inside the update loop, so it keeps only what is lost by the interval's end.
         `last_sync` is the update after which the target last moved; None if unknown. `tail` (B, 3)

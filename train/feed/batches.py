@@ -39,14 +39,14 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, _NO_SHARES)
 
 @dataclass(frozen=True)
 class ReplayBatch:
-    """One batch: the logged rows first, then the fresh ones."""
+    """One batch: first the logged rows, from K stores with S strata, then the fresh ones."""
 
     gather: Callable[[], Tensor]  # returns the packed rows, if none is overwritten in the ring yet
     weight: Tensor | None  # (B,) float32
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
     slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
-    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) logged shares of K stores
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) shares of the logged rows
     wanted: F64 = field(default_factory=lambda: np.empty(0))  # (S,) quotas of the whole batch
 
     @property
@@ -228,7 +228,7 @@ class LogTerms:
         """Make the mask that the loss needs on these logs.
 
         Raises:
-            ConfigError: the loss has a margin term, but there are no logs, or none of a policy.
+            ConfigError: the loss has a margin term, but there are no logs, or no rows of a policy.
         """
         if logs is None:
             _refuse_without_logs(config.loss)

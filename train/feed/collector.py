@@ -39,7 +39,7 @@ from restock.train.feed.teacher import CheckedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
-_EPISODES_PER_QUERY = 32  # because planning a query costs as much as labelling 1,000 steps
+_EPISODES_PER_QUERY = 32  # at once: planning a query takes as long as labelling 1,000 steps
 _NO_VALUES = ("{}",)  # perturbation values of a twin that reports only the name
 
 
@@ -97,7 +97,7 @@ class Collector(Stateful):
         strata: FreshStrata | None = None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
-        self.strata = strata  # of the ring's rows; None: conditions serve as strata
+        self.strata = strata  # assigns the ring's rows to strata; None: conditions are the strata
         self.goal = task.goal != "none"  # whether success is defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
@@ -267,7 +267,7 @@ class Collector(Stateful):
         self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
 
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
-        """Label ended episodes, a number at once; return rows for the run's table `episodes`."""
+        """Label ended episodes if enough wait; return rows of the run's table `episodes`."""
         waiting = self._unlabelled
         if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
             return []

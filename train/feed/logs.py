@@ -101,7 +101,7 @@ class Logs:
     ) -> Logs:
         """Read a panel's rows into memory (memory-mapped if it is larger than 4 GiB).
 
-        Ages of rows are counted up to `as_of_ns`, when training began; None: to the newest row.
+        Ages of rows are counted to `as_of_ns`, the start of training; None: to the newest row.
         """
         rows = np.asarray(panel.rows)
         if rows.nbytes <= _IN_MEMORY_BYTES:
@@ -140,7 +140,7 @@ class Logs:
         seed: int,
         fresh: Bools | None = None,
     ) -> LoggedSampler:
-        """Make the sampler of the logged rows: by the panel's mixture, or without one by `shares`.
+        """Make the logged rows' sampler: by the panel's mixture, or by `shares` without a panel.
 
         `fresh` (S,) is whether rows of a ring can be in each stratum; None: there is no ring.
 

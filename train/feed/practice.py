@@ -65,7 +65,7 @@ class Practice(Stateful):
     ) -> None:
         """`goal` is whether success is defined."""
         self.config, self._set = config, set_shares
-        # The rule "natural" needs no arms for ordered missions: they count as their kind's.
+        # Under the rule "natural", ordered missions count for the arms of their kind.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)
         count = len(self.arms)
         self.names = [arm.name for arm in self.arms]
@@ -239,7 +239,7 @@ def with_floor(weights: F64, floor: float) -> F64:
 def moved(shares: F64, wanted: F64, most: float) -> F64:
     """Move `shares` towards `wanted`, none by more than `most`; they still sum to 1.
 
-    All move by the same fraction of their distance, so a floor under both is a floor of the result.
+    All move by the same fraction of their distance, so the result keeps a floor that both keep.
     """
     farthest = float(np.abs(wanted - shares).max())
     part = 1.0 if farthest <= most else most / farthest

@@ -176,8 +176,8 @@ def episode_sums(
 ) -> dict[str, NDArray[Any]]:
     """Sum rows by episode and pair, into columns episode, pair, drawn_rows, weight.
 
-    Rows of one episode are drawn together and are alike. Intervals of what a critic was fed depend
-    on the number of episodes, not of rows, so `restock compare` resamples episodes.
+    Rows of one episode are drawn together and are alike, so how certain it is what a critic was fed
+    depends on the number of episodes, not of rows: `restock compare` resamples episodes.
     """
     first = int(episode.min(initial=0))
     key = (episode.astype(np.int64) - first) * pairs + pair
@@ -265,7 +265,7 @@ def add_names(
     """Add names to the columns of `fresh_audit`; rows in no stratum get `unlabelled`."""
     names = [conditions[code] if code >= 0 else None for code in audit["condition"].tolist()]
     of_strata = audit["of_stratum"].tolist()
-    values = audit["perturbation_values"]  # of (name, value), which are lists from a checkpoint
+    values = audit["perturbation_values"]  # pairs (name, value); lists if from a checkpoint
     columns = {
         **audit,
         "episode": [str(key) for key in audit["key"].tolist()],
@@ -509,7 +509,7 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
     pairs = np.flatnonzero(source.drawn.sum(axis=2).ravel())  # (P,)
 
     def of_task(by_cell: Ints) -> Ints:
-        """Return (P, A) of counts (S, C, a) or (S * C, a): pairs that occurred, all actions."""
+        """Reduce counts (S, C, a) or (S * C, a) to the pairs that occurred, all actions: (P, A)."""
         of_pairs = by_cell.reshape(source.pairs, -1)[pairs]
         padding = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
         whole: Ints = np.pad(of_pairs, padding)[:, :count]

@@ -72,7 +72,7 @@ class MixedFeed:
     """A source of batches: rows of a panel and of a ring of fresh rows, by the panel's mixture.
 
     Args:
-        capacity, num_envs, observation_size, n_step: the arguments of the `FreshRing`, `ring`.
+        capacity, num_envs, observation_size, n_step: arguments of `ring`, a `FreshRing`.
         discount: discount of the ring's rows; None: the panel's, or .99 without a panel.
         panel: None for fresh rows alone.
 
@@ -164,7 +164,7 @@ class MixedFeed:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
 
     def draw_logs(self, batch_size: int) -> BatchDraw:
-        """Draw a batch's logged rows (L,) by the mixture; while the ring is empty, all its rows.
+        """Draw a batch's logged rows (L,) by the mixture: the whole batch while the ring is empty.
 
         Raises:
             MixtureError: the ring is empty and the panel's rows have reached their limit of draws;
@@ -196,7 +196,7 @@ class MixedFeed:
         return drawing
 
     def draw_fresh(self, count: int) -> Ints:
-        """Draw `count` slots of the ring uniformly, from rows below the mixture's limit of age.
+        """Draw `count` slots of the ring uniformly, of rows not older than the mixture allows.
 
         Raises:
             MixtureError: the ring has no row, or only rows above that age.
@@ -272,8 +272,8 @@ class MixedFeed:
     def evaluated(self, episodes: Rows = (), steps: Rows = ()) -> None:
         """Record an evaluation: rows of the run's tables `evaluations` and `evaluation_buffer`.
 
-        `compare` needs condition, episode_seed, success and return of each episode. `diagnose`
-        needs condition, rows, td_abs_mean, td_online_abs_mean and q_lag, a row per condition.
+        `compare` needs condition, episode_seed, success and return in `episodes`. `diagnose` needs
+        condition, rows, td_abs_mean, td_online_abs_mean and q_lag in `steps`, per condition.
         """
         if self.run is None:
             return
@@ -324,7 +324,7 @@ class MixedFeed:
             self.episode_labels.give_up(key)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Save the time run so far, not the time of the start: clocks differ between processes."""
+        """Save the elapsed time instead of the start time: another process has another clock."""
         return vars(self) | {"_begun": time.monotonic() - self._begun}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -160,7 +160,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         done: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        """Add one step of every environment; if an episode ended, `next_obs` is its last one."""
+        """Add one step of every environment; `next_obs` is the last of an episode that ended."""
         ring = self.ring
         done = np.asarray(done, np.bool_)
         cut = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos]) & done

@@ -223,7 +223,7 @@ class WandbSink:
         self._run.log(dict(values), step=step)
 
     def flush(self) -> None:
-        """Do nothing: W&B's own process writes all the time."""
+        """Do nothing: W&B writes continuously, in a process of its own."""
 
     def close(self) -> None:
         self._run.finish()

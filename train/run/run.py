@@ -274,7 +274,7 @@ def software_versions() -> dict[str, str]:
 
 
 def panel_document(panel: Panel) -> dict[str, Any]:
-    """Return the part of `config.json` about the panel, for runs of every library."""
+    """Return what `config.json` has about the panel, in runs of Restock and of other libraries."""
     header = panel.header
     return {
         "path": str(panel.path.resolve()),
@@ -292,7 +292,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
 
 
 def now_ns() -> int:
-    """Return the wall time in ns; ages of logged rows refer to this time at the run's start."""
+    """Return the wall time in ns; a run keeps that of its start, to count ages of logged rows."""
     return time.time_ns()
 
 
@@ -426,7 +426,7 @@ def chosen_policy(run: Run) -> Literal["best", "latest", "mean"]:
 
 
 def latest_drives(run: Run) -> bool:
-    """Return whether the latest policy drives: what the run learned was never evaluated."""
+    """Return whether the latest policy drives, as what the run learned was never evaluated."""
     latest, best = _read_state(run.latest), _read_state(run.best)
     if not latest:
         return False

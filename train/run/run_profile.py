@@ -23,7 +23,7 @@ from restock.train.run.run import Run
 
 
 def profile_document(profile: Profile) -> dict[str, object]:
-    """Return the part of `config.json` about the profile, for runs of every library."""
+    """Return what `config.json` has about the profile, in runs of Restock and other libraries."""
     return {
         "task_hash": profile.task.hash,
         "actions": profile.task.action_names,

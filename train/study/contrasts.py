@@ -68,7 +68,7 @@ class Contrast:
     high: float | None
     sd: float | None  # standard deviation of the paired differences
     p: float | None  # p value of the hypothesis that there is no difference
-    p_holm: float | None = None  # p adjusted by Holm for all contrasts but the primary; it has none
+    p_holm: float | None = None  # p adjusted by Holm's method; None for the primary contrast
     no_interval: str | None = None  # why there is neither an interval nor a p value
 
     def as_json(self) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def contrast(
         return None
     differences = values[:, 0] - values[:, 1]
     interval, p = paired_t(differences)
-    interval = interval.within(-1.0, 1.0)  # of two shares
+    interval = interval.within(-1.0, 1.0)  # limits of a difference of shares
     return Contrast(
         arm,
         baseline,
@@ -261,7 +261,7 @@ def _last_progress(path: Path) -> dict[str, Any] | None:
 
 
 def _success_by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
-    """Return success by environment steps and cell; a later evaluation at the same steps counts."""
+    """Return success by environment steps and cell; of two evaluations at one step, the later."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
     for row in table.to_pylist():
         step, update = int(row["env_steps"]), int(row["gradient_steps"])

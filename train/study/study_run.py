@@ -255,7 +255,7 @@ NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")  # measures that are never b
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
-    """Return the study and its results as JSON values; `run_study` returned the `comparisons`."""
+    """Return the study and its results as JSON values; `comparisons` come from `run_study`."""
     compared = [
         _comparison_json(pair, comparison)
         for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
