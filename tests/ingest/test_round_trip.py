@@ -188,9 +188,9 @@ def test_every_step_is_in_its_episode(trip: RoundTrip) -> None:
 def test_episode_endings_match(trip: RoundTrip) -> None:
     last = np.cumsum(trip.steps) - 1
     reached = last[[driven.terminated for driven in trip.driven]]
-    assert np.flatnonzero(trip.row("terminated")).tolist() == reached.tolist()
+    assert np.flatnonzero(trip.row_values("terminated")).tolist() == reached.tolist()
     cut = last[[not driven.terminated for driven in trip.driven]]
-    assert np.flatnonzero(trip.row("truncated")).tolist() == cut.tolist()
+    assert np.flatnonzero(trip.row_values("truncated")).tolist() == cut.tolist()
 
 
 def test_observations_match_twin(trip: RoundTrip) -> None:
@@ -200,10 +200,10 @@ def test_observations_match_twin(trip: RoundTrip) -> None:
     closing = [place[name] for name in names if name.startswith("closing_")]
     others = [name for name in names if not name.startswith(("clearance_", "closing_"))]
     for column, seen in (
-        ("observation", trip.saw("observation", last=-1)),
-        ("next_observation", trip.saw("observation", first=1)),
+        ("observation", trip.twin_values("observation", last=-1)),
+        ("next_observation", trip.twin_values("observation", first=1)),
     ):
-        stored = trip.row(column)
+        stored = trip.row_values(column)
         for name in others:
             error = np.abs(stored[:, place[name]] - seen[:, place[name]])
             assert error.max() <= SCALARS.get(name, SINGLE) + SINGLE, (column, name)
@@ -212,10 +212,10 @@ def test_observations_match_twin(trip: RoundTrip) -> None:
         off = metres > LIDAR_LSB_M / 2 + 1e-5
         assert (np.maximum(stored[:, near], seen[:, near])[off] == 1.0).all(), column
         assert off.mean() < 1e-3, column
-    before, after = trip.row("observation"), trip.row("next_observation")
+    before, after = trip.row_values("observation"), trip.row_values("next_observation")
     change = after[:, near] - before[:, near]
     np.testing.assert_allclose(after[:, closing], change, atol=1e-6)
-    first = trip.row("step_index") == 0
+    first = trip.row_values("step_index") == 0
     assert not before[first][:, closing].any()
 
 
@@ -223,7 +223,7 @@ def test_navigation_commands_match_twin(trip: RoundTrip) -> None:
     names = ("nav_speed_mps", "nav_yaw_rate_radps")
     seen = [np.concatenate([d.drive.signals[name][:-1] for d in trip.driven]) for name in names]
     for name, values in zip(names, seen, strict=True):
-        np.testing.assert_array_equal(trip.row(name), values.astype(np.float32))
+        np.testing.assert_array_equal(trip.row_values(name), values.astype(np.float32))
     # The planner drives as it proposes unless it explores; other drivers need not.
     given = np.concatenate([d.drive.command for d in trip.driven])
     same = (np.stack(seen, axis=-1) == given).all(axis=1)
@@ -234,16 +234,16 @@ def test_navigation_commands_match_twin(trip: RoundTrip) -> None:
 
 
 def test_next_observation_equals_observation_of_next_row(trip: RoundTrip) -> None:
-    same = np.diff(trip.row("episode_index")) == 0
-    before, after = trip.row("observation"), trip.row("next_observation")
+    same = np.diff(trip.row_values("episode_index")) == 0
+    before, after = trip.row_values("observation"), trip.row_values("next_observation")
     np.testing.assert_array_equal(after[:-1][same], before[1:][same])
 
 
 def test_actions_and_rewards_match_twin(trip: RoundTrip) -> None:
-    assert trip.row("action").tolist() == trip.saw("action").tolist()
-    clearance = trip.signal("clearance_m")
+    assert trip.row_values("action").tolist() == trip.twin_values("action").tolist()
+    clearance = trip.twin_signal("clearance_m")
     on_edge = np.abs(clearance - TASK.rewards.tight_clearance_m) < LIDAR_LSB_M
-    error = np.abs(trip.row("reward") - trip.saw("reward"))
+    error = np.abs(trip.row_values("reward") - trip.twin_values("reward"))
     assert error[~on_edge].max() < 1e-5
     assert error.max() <= abs(TASK.rewards.tight) + 1e-5
     assert on_edge.mean() < 0.05
@@ -254,7 +254,7 @@ def test_drivers_conditions_and_perturbations_match_twin(trip: RoundTrip) -> Non
     drivers = [entry for drive in drives for entry in drive.policy]
     assert trip.rows["behaviour_policy"].to_pylist() == [name for name, _, _ in drivers]
     assert trip.rows["behaviour_version"].to_pylist() == [version for _, version, _ in drivers]
-    assert trip.row("action_probability") == pytest.approx([p for _, _, p in drivers], abs=1e-4)
+    assert trip.row_values("action_probability") == pytest.approx([p for _, _, p in drivers], abs=1e-4)
     truth = [name for drive in drives for name in drive.true_condition]
     assert trip.rows["true_condition"].to_pylist() == truth
     assert len(set(truth)) > 2
