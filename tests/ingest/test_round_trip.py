@@ -254,7 +254,9 @@ def test_drivers_conditions_and_perturbations_match_twin(trip: RoundTrip) -> Non
     drivers = [entry for drive in drives for entry in drive.policy]
     assert trip.rows["behaviour_policy"].to_pylist() == [name for name, _, _ in drivers]
     assert trip.rows["behaviour_version"].to_pylist() == [version for _, version, _ in drivers]
-    assert trip.row_values("action_probability") == pytest.approx([p for _, _, p in drivers], abs=1e-4)
+    assert trip.row_values("action_probability") == pytest.approx(
+        [p for _, _, p in drivers], abs=1e-4
+    )
     truth = [name for drive in drives for name in drive.true_condition]
     assert trip.rows["true_condition"].to_pylist() == truth
     assert len(set(truth)) > 2

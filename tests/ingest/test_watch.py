@@ -55,35 +55,35 @@ def test_file_is_ingested_after_its_upload(bag, tmp_path):
     (file,) = bag.glob("*.mcap")
     upload, watch = tmp_path / "run.mcap", FakeWatch(tmp_path)
     upload.write_bytes(file.read_bytes()[:-1000])
-    assert watch.after(0) == watch.after(STILL_S - 1) == []
-    assert watch.after(1) == []
+    assert watch.complete_after(0) == watch.complete_after(STILL_S - 1) == []
+    assert watch.complete_after(1) == []
     assert watch.news == [("waiting", "run.mcap has no MCAP footer yet")]
-    assert (watch.after(60), watch.news) == ([], [])  # reported once
+    assert (watch.complete_after(60), watch.news) == ([], [])  # reported once
     upload.write_bytes(file.read_bytes())
-    assert watch.after(0) == []
-    assert watch.after(STILL_S) == ["run.mcap"]
+    assert watch.complete_after(0) == []
+    assert watch.complete_after(STILL_S) == ["run.mcap"]
     watch.take(upload)
-    assert watch.after(1000) == []
+    assert watch.complete_after(1000) == []
 
 
 def test_bag_is_ingested_once_its_metadata_exists(bag, tmp_path):
     arrived, watch = tmp_path / "bag", FakeWatch(tmp_path)
     arrived.mkdir()
     shutil.copy(bag / METADATA, arrived)
-    watch.after(0)
-    assert watch.after(STILL_S) == []
+    watch.complete_after(0)
+    assert watch.complete_after(STILL_S) == []
     ((event, why),) = watch.news
     assert event == "waiting"
     assert why.startswith(f"{METADATA} lists ")
     (file,) = bag.glob("*.mcap")
     shutil.copy(file, arrived)
     (arrived / METADATA).unlink()
-    watch.after(0)
-    assert watch.after(STILL_S) == []
+    watch.complete_after(0)
+    assert watch.complete_after(STILL_S) == []
     assert watch.news == [("waiting", f"no {METADATA} yet")]
     shutil.copy(bag / METADATA, arrived)
-    watch.after(0)
-    assert watch.after(STILL_S) == ["bag"]
+    watch.complete_after(0)
+    assert watch.complete_after(STILL_S) == ["bag"]
 
 
 def test_unfinished_file_is_ingested_only_with_salvage(bag, tmp_path):
@@ -91,8 +91,8 @@ def test_unfinished_file_is_ingested_only_with_salvage(bag, tmp_path):
     (tmp_path / "run.mcap").write_bytes(file.read_bytes()[:-1000])
     for salvage in (False, True):
         watch = FakeWatch(tmp_path, salvage=salvage)
-        assert watch.after(0) == watch.after(STILL_S) == []
-        assert watch.after(SALVAGE_AFTER_S) == ["run.mcap"] * salvage
+        assert watch.complete_after(0) == watch.complete_after(STILL_S) == []
+        assert watch.complete_after(SALVAGE_AFTER_S) == ["run.mcap"] * salvage
 
 
 @pytest.mark.parametrize(
@@ -103,30 +103,30 @@ def test_unfinished_file_is_ingested_only_with_salvage(bag, tmp_path):
 def test_only_temporary_failures_are_retried(error, is_retried, bag, tmp_path):
     shutil.copytree(bag, tmp_path / "bag")
     watch = FakeWatch(tmp_path)
-    watch.after(0)
-    assert watch.after(STILL_S) == ["bag"]
+    watch.complete_after(0)
+    assert watch.complete_after(STILL_S) == ["bag"]
     assert watch.take(tmp_path / "bag", error)
-    assert watch.after(RETRY_S - 1) == []
-    assert watch.after(1) == ["bag"] * is_retried
+    assert watch.complete_after(RETRY_S - 1) == []
+    assert watch.complete_after(1) == ["bag"] * is_retried
     assert not watch.take(tmp_path / "bag", error)  # reported once
     os.utime(tmp_path / "bag" / METADATA, (1, 1))  # as if uploaded again
-    watch.after(0)
-    assert watch.after(STILL_S) == ["bag"]
+    watch.complete_after(0)
+    assert watch.complete_after(STILL_S) == ["bag"]
 
 
 def test_disappeared_folder_is_reported_and_recognised_later(bag, tmp_path):
     folder = tmp_path / "in"
     shutil.copytree(bag, folder / "bag")
     watch = FakeWatch(folder)
-    watch.after(0)
-    watch.after(STILL_S)
+    watch.complete_after(0)
+    watch.complete_after(STILL_S)
     watch.take(folder / "bag")
     folder.rename(tmp_path / "away")
-    assert (watch.after(1), watch.news) == ([], [("gone", "")])
-    assert (watch.after(1), watch.news) == ([], [])
+    assert (watch.complete_after(1), watch.news) == ([], [("gone", "")])
+    assert (watch.complete_after(1), watch.news) == ([], [])
     (tmp_path / "away").rename(folder)
-    assert (watch.after(1), watch.news) == ([], [("back", "")])
-    assert watch.after(STILL_S) == []
+    assert (watch.complete_after(1), watch.news) == ([], [("back", "")])
+    assert watch.complete_after(STILL_S) == []
 
 
 WATCH = """
