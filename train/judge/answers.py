@@ -170,7 +170,7 @@ class Relation:
     x: str
     y: str
     lags: Ints
-    of: Callable[[FedRows], tuple[F64, F64]]  # returns x and y of the rows, (N,) or (N, S) each
+    of: Callable[[FedRows], tuple[F64, F64]]  # x and y of rows, (N,), or (N, S) for S lidar sectors
     defined: bool = True  # x and y are the same quantity: without a twin, the expected gain is 1
     zero: str = ""  # name under which the gain is reported if it should be 0; else ""
     most: float = GAIN  # largest ratio to the twin's gain, either way; with `zero`, largest |gain|
@@ -241,7 +241,7 @@ def _near_slip(rows: FedRows) -> Bools:
 
 
 def _find_slippery_episodes(rows: FedRows, moves: F64) -> Bools:
-    """Return which rows (N,) are in episodes with slip, of recordings that also move without."""
+    """Return which rows (N,) are in slippery episodes of recordings that also move without slip."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
@@ -373,8 +373,8 @@ NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` for different quantities: driver and pl
 _KNOWN_GAIN = 0.3  # if the gain, relative to the twin's, is smaller, a delay means nothing
 HELD = 3  # consecutive steps of one action after which the motion counts as that action's
 _MIN_HELD = 15  # least rows that hold an action, to judge its motion
-_MIN_DISTANCE = 0.25  # from an action's own motion; 1 is the fastest action on each axis
-_MIN_SHARE = 0.8  # an action is another one if at least this share of its rows moves like that
+_MIN_DISTANCE = 0.25  # a motion this far from its action's is odd; 1: the fastest action, by axis
+_MIN_SHARE = 0.8  # least share of an action's rows that must move like the same other action
 TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # (relation, rows left out) -> fit
 
 
@@ -384,7 +384,7 @@ class Broken:
 
     off_by: float  # root mean square error in these stretches, in the unit of y
     usually: float  # root mean square error in all stretches of the other robots
-    mended: dict[str, tuple[float, float]]  # cause -> (share that holds without, its size)
+    mended: dict[str, tuple[float, float]]  # cause -> (share that holds without it, size)
 
 
 @dataclass
@@ -420,7 +420,7 @@ class Answer:
 
 
 def answers(logs: FedRows, twin: FedRows | None, of_twin: TwinFits) -> list[Answer]:
-    """Compare every relation in logs and twin. `of_twin` caches the twin's fits between calls."""
+    """Compare logs and twin by every relation. `of_twin` caches the twin's fits between calls."""
     rng = np.random.default_rng([0, 1])
     return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
 
@@ -455,7 +455,7 @@ def _answer(
     most, most_left = (
         (relation.most, UNEXPLAINED) if relation.defined else (NOISY_GAIN, NOISY_UNEXPLAINED)
     )
-    if expected is None:  # the gain should be 1, and commands precede what they cause
+    if expected is None:  # no twin: the gain should be 1, and commands precede their effects
         gain = interval_of(found.gain, found.gains, found.clusters)
         delay = interval_of(found.delay, found.delays, found.clusters)
         made = [judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,

@@ -121,7 +121,7 @@ def _group_by_start(logs: FedRows) -> NDArray[np.str_]:
     np.minimum.at(start, place, logs.logged_ns)
     order = np.argsort(start, kind="stable")
     middle = np.cumsum(rows[order]) - rows[order] / 2
-    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # leeway for whole recordings
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # + max: recordings stay whole
     begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
     named = np.empty(len(names), object)
     for first, end in pairwise(begins.tolist()):

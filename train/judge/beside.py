@@ -23,7 +23,7 @@ from restock.train.judge.row_checks import implied_reward
 MIN_BESIDE = 4  # fewest robots or recordings that can be compared with each other
 _MIN_AGREEING = 0.75  # least share of the other robots that must agree with their median
 GAIN = 1.02  # largest ratio to the others' gain, either way, for two sensors of the same motion
-ANSWER, NOISY = 1.15, 1.25  # `GAIN` if quantities are the same, and if they differ
+ANSWER, NOISY = 1.15, 1.25  # `GAIN` for other relations of like quantities, and of unlike ones
 _DELAY_STEPS, _UNEXPLAINED = 0.4, 0.1  # largest differences of delay and unexplained share
 
 
@@ -195,7 +195,7 @@ class Stretches:
     """Expected and measured y of one robot and relation, cut into W stretches of its drives."""
 
     expected: F64  # (N,) y that the relation predicts
-    measured: F64  # (N,) y
+    measured: F64  # (N,) y in the logs
     episode: Ints  # (N,)
     at: Ints  # (n,) rows that are judged
     stretch: Ints  # (n,) number of each judged row's stretch, 0 to W - 1
@@ -204,10 +204,10 @@ class Stretches:
 
     @classmethod
     def of(cls, relation: Relation, rows: FedRows, kernel: F64, offset: float) -> Stretches:
-        """Cut a robot's rows into stretches; drop rows that slip, then stretches half empty."""
+        """Cut a robot's rows into stretches; omit rows that slip, then half-empty stretches."""
         x, measured = relation.of(rows)
         expected = lagged(x, [rows.before(int(lag)) for lag in relation.lags]) @ kernel + offset
-        # Rows with a wrong pose are labelled as slip, too, but that pose outruns the wheels.
+        # Rows with a wrong pose are labelled as slip, too, but there the pose outruns the wheels.
         slips = np.abs(rows.after("localised_speed")) < np.abs(rows.after("wheel_speed"))
         if ends.WHEEL_TURN in (relation.x, relation.y):
             slips = np.abs(rows.after("gyro_yaw_rate")) < np.abs(wheel_turn(rows))
@@ -225,7 +225,7 @@ class Stretches:
         return cls(expected, measured, rows.episode, at, stretch, left, moves)
 
     def relative_error(self, usually: float) -> F64:
-        """Return each stretch's root mean square error (W,) over its own plus the usual motion."""
+        """Return each stretch's RMS error, (W,), relative to its own plus the usual motion."""
         return np.sqrt(self.left / np.maximum(self.moves + usually, 1e-12))
 
     def mended(
@@ -271,7 +271,7 @@ class Stretches:
         return np.where(same, self.expected[row], np.nan)
 
     def _share_held(self, expected: F64, broken: Bools, most: float, usually: float) -> float:
-        """Return the share of broken stretches that hold with other expected values (n,).
+        """Return the share of broken stretches that would hold with these expected values (n,).
 
         Rows with NaN are left out.
         """
@@ -311,13 +311,13 @@ _KINDS = {
     FLICKER: _Kind("sector that sees something else for one row", 0.02),
     REWARDS: _Kind("row's reward is not exactly the task's own", 0.02),
 }
-_MOVES = 0.2  # a command moves the robot above this share of the fastest command
+_MOVES = 0.2  # commands above this share of the fastest one should move the robot
 _EQUAL = 1e-5  # values equal each other up to this share of their signal's spread
 _SAME = 1e-4  # two signals equal each other up to this difference, in m/s or rad/s
 _MIN_DRIVEN = 100  # least rows of a driver whose actions are counted
 _LESS = 0.9  # a robot's maximum is odd only below this share of the others' median
 _UNSEEN = 0.999  # lidar entries of at least this saw nothing
-_JUMP, _STILL = 0.15, 0.05  # a flicker differs by more from the rows around it, they by less
+_JUMP, _STILL = 0.15, 0.05  # a flicker differs by more from both neighbours, which differ by less
 _EXACT = 2e-3  # largest error of a reward that is the task's own
 
 
@@ -330,7 +330,7 @@ class Tally:
     found: int
     of: int
     size: float = 0.0  # `HELD`: seconds that a value lasts; `LIMIT`, `FAR`: the largest value
-    rows: Bools | None = None  # (N,) which rows are odd; None if relations cannot do without them
+    rows: Bools | None = None  # (N,) which rows are odd; None if relations cannot skip them
     note: str = ""
 
     @property

@@ -94,7 +94,7 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     if changed:
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
-        ends.pop(PLAN, None)  # another goal explains the plan's scale
+        ends.pop(PLAN, None)  # a wrong goal explains the plan's scale
     if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows):
         ends.pop(LIDAR, None)  # these causes explain the lidar's relations
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
@@ -113,7 +113,7 @@ def _signal_findings(
     if "EPISODES_REPEATED" in causes:
         return [], ()  # repeated episodes repeat every value
     if "LIDAR_OFF" in causes:
-        off.pop(ZEROS + LIDAR, None)  # if ranges are too short, those to near things become 0
+        off.pop(ZEROS + LIDAR, None)  # ranges that are too short become 0 near things
     by_end: dict[str, list[tuple[str, Comparison]]] = {}
     for check, row in off.items():
         kind = next(one for one in OF_SIGNALS if check.startswith(one))

@@ -48,7 +48,7 @@ from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.floors.layout import DEFAULT
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
-WINDOWS = 3  # number of windows (evaluations), the last ones, over which figures are medians
+WINDOWS = 3  # figures are medians over so many of the last windows (evaluations)
 _SETTLED_LAGS = 10  # a run is old enough to judge L after so many mean ages of its target
 _MIN_UPDATES = 1500  # updates from which L is judged in younger runs, too, unless it is falling
 _FALLING = 0.75  # L is falling if its ratio of the last to the first window is below this
@@ -148,8 +148,8 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
 def _explain_youth(last: Sequence[Window], rule: TargetRule) -> str:
     """Explain why the run may be too young to judge an L past its limit; "" if it is not.
 
-    While values grow from 0, every target lags. Then L falls later on. If it does not
-    fall, the rule is too slow for any run to be old enough, and the rule is at fault.
+    While values grow from 0, every target lags, but L falls with time. If L does not fall, the
+    rule is too slow for any run to be old enough, and the rule is at fault.
     """
     updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
     if updates >= settled:

@@ -46,7 +46,7 @@ class Comparison:
     "undecided" if the interval reaches into the range.
     """
 
-    check: str  # its name in `causes.toml` and the docs
+    check: str  # name of the check in `causes.toml` and the docs
     what: str  # what was compared, for people
     measure: str  # what `effect` is: "ratio", "difference", "share", …
     status: Status
@@ -56,7 +56,7 @@ class Comparison:
     low: float | None = None
     high: float | None = None
     least: float | None = None  # lower end of the allowed range
-    most: float | None = None  # its upper end
+    most: float | None = None  # upper end of the allowed range
     logs_rows: int = 0
     twin_rows: int = 0
     note: str = ""

@@ -62,8 +62,8 @@ class Measure:
     """A measure by which a policy may not be worse.
 
     `better` returns by how much the policy was better in a pair of episodes (policy, baseline), or
-    None if the pair does not show it. It is clipped to ±`bound`. `variance` is its expected
-    variance.
+    None if the pair does not show it. The difference is clipped to ±`bound`; `variance` is the
+    expected variance of the difference.
     """
 
     name: str
@@ -152,7 +152,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Return a name for people: the condition, then perturbation and measure if unusual."""
+        """Return a name for people: the condition, then perturbation and measure unless default."""
         parts = [_words(self.condition)]
         parts += [self.perturbation] * (self.perturbation != CLEAN)
         parts += [_words(self.measure.name)] * (self.measure.name != SUCCESS)

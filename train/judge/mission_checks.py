@@ -64,7 +64,7 @@ _MIN_LOOKS = 40  # least ranges for a sector or a mission to be judged
 DRIVEN = "driver"
 OTHER_DRIVER = 0.1  # largest share of stretches in another's style, beyond the usual share
 _MAX_CONFUSED = 0.1  # largest share of the others' stretches that may be taken for another driver's
-_STRETCH = 10  # shorter stretches, in steps, are not counted
+_STRETCH = 10  # stretches with fewer steps are not counted
 CHOSEN = "chosen on outcome: "
 GAP = 0.3  # largest difference in success without and with a condition
 _MIN_MISSIONS = 5  # least missions with and without a condition, and least stretches of a driver
@@ -340,7 +340,7 @@ def _driving_features(rows: FedRows) -> F64:
 
 
 def _best_move(floor: Warehouse, places: F64) -> F64:
-    """Return the move (2,) with which places fit walls best; long moves have a small penalty."""
+    """Return the move (2,) that best fits lidar returns to walls; length has a small penalty."""
     places = places[:: len(places) // _RETURNS + 1]
     best = np.zeros(2)
     for step, reach in ((_STEP_M, _SEARCH_M), (_FINE_M, _STEP_M)):
