@@ -17,19 +17,19 @@ from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
 LIKELY = 0.2  # steps without a label and at least this probability may be a missed event
-EDGE_STEPS = 2  # steps this close to an event are its edge
+EDGE_STEPS = 2  # unlabelled steps this close to a labelled event are no missed event
 
 
 @dataclass(frozen=True)
 class DoubtfulEvent:
-    """One event of a label, or steps that may be a missed event. Times are log time, UTC."""
+    """Successive steps with a label, or that may lack it. Times are log time, UTC."""
 
     event: str  # EPISODE/FIRST-LAST/CONDITION
     condition: str
     labelled: bool  # False: a possible missed event
     probability: float | None  # mean over its steps; None: the condition has no probability
-    margin: float  # log odds that the label is right, or log2 of its steps; small is doubtful
-    why: str  # which of the two the margin is: probability or length
+    margin: float  # log odds that the label is right, or log2 of the event's steps; small: doubtful
+    why: str  # what the margin is computed from: probability, or length in steps
     recording: str
     source_file: str
     start_time: datetime
@@ -39,7 +39,7 @@ class DoubtfulEvent:
     episode_id: str
     first_step: int
     last_step: int
-    transition_id: int  # of its first step
+    transition_id: int  # id of the event's first step
 
 
 _COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
@@ -49,9 +49,9 @@ _COLUMNS += ["open", "verdict"]  # columns of a review file
 def doubtful_events(store: Store, most: int = 10**9) -> list[DoubtfulEvent]:
     """Return up to `most` events, the most doubtful label first.
 
-    For a condition with a probability, the first are events whose mean log odds support the label
-    least, and steps without the label that are likely enough to be a missed event. For other
-    conditions, they are the shortest events. Corrected events are left out.
+    Labels of a condition with a probability are the more doubtful the less the mean log odds of
+    their steps support them; steps without the label may be missed events. Labels of other
+    conditions are the more doubtful the shorter their events. Corrected events are left out.
 
     Raises:
         StoreError: the store has no recordings.
@@ -101,17 +101,17 @@ def review_csv(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-MAX_EVENTS = 5_000  # on a page
+MAX_EVENTS = 5_000  # largest number of events on a page
 _HALF = MAX_EVENTS // 2
 
 
 def page_events(store: Store) -> tuple[list[dict[str, Any]], int]:
-    """Return the events of a page, and how many there are in all.
+    """Return the events of a page, and how many events the store has in all.
 
-    Each has the fields of `DoubtfulEvent`, its robot and week, and its place in a random order of
-    the labelled events (None: not labelled). That order depends only on the events' names, so its
-    first events are a random sample of the labelled ones. If there are more than MAX_EVENTS, the
-    page has those that come first in one of the two orders.
+    Each has the fields of `DoubtfulEvent`, its robot and week, its place in the order of doubt, and
+    its place in a random order of the labelled events (None: not labelled), which depends only on
+    the events' names. If there are more than MAX_EVENTS, the page has the events that come first in
+    one of the two orders.
     """
     events = doubtful_events(store)
     robots = dict(store.sql("SELECT recording_id, tags['robot'] FROM recordings").fetchall())

@@ -28,10 +28,10 @@ MAX_NOTE = 2_000  # characters
 
 
 class Entry(Line, frozen=True, kw_only=True, tag="verdict", tag_field="kind"):
-    """One verdict of a page; an empty one takes back those in `instead_of`."""
+    """One verdict from a page; an empty verdict takes back the verdicts in `instead_of`."""
 
     id: Annotated[str, Meta(min_length=1, max_length=40)]
-    by: Annotated[str, Meta(max_length=40)]  # a random name of the browser
+    by: Annotated[str, Meta(max_length=40)]  # a random name that stands for the browser
     event: str
     note: Annotated[str, Meta(max_length=MAX_NOTE)] = ""
     at: str = ""  # UTC, by the server's clock
@@ -110,7 +110,7 @@ class Journal:
         self.refresh()
 
     def counting(self) -> list[Entry]:
-        """Return the verdicts that count: not replaced, not taken back, not yet in the store."""
+        """Return the verdicts that are not replaced, not taken back, and not yet in the store."""
         gone = {
             name
             for line in self.lines
@@ -131,7 +131,7 @@ class Written:
 
     @property
     def document(self) -> dict[str, object]:
-        """Return the result as in `--json` and on the page."""
+        """Return the result as JSON values, for `--json` and for the page."""
         return {
             "version": self.version,
             "verdicts": self.taken,

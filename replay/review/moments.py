@@ -30,11 +30,11 @@ from restock.replay.store.store import Store
 from restock.replay.trace.moment import SeenScan, sector_ranges, seen_of
 
 AROUND_S = 8.0  # seconds shown before and after an event
-MAX_STEPS = 400  # steps shown
-MAX_ROWS = 4_000  # rows of the episode that are read around the event
+MAX_STEPS = 400  # largest number of steps shown
+MAX_ROWS = 4_000  # largest number of the episode's rows that are read around the event
 MAX_RECORDING_BYTES = 256 << 20  # scans and plans are not read from larger recordings
-MAX_FRAMES = 12  # per camera
-FRAME_PX = 400  # largest width and height
+MAX_FRAMES = 12  # largest number of frames per camera
+FRAME_PX = 400  # largest width and height of a frame
 WALL_M, WALL_ROWS, MAX_WALLS, REACH_M = 0.1, 5_000, 6_000, 8.0
 SPEEDS = {
     "wheels": "wheel_speed_mps",
@@ -64,7 +64,7 @@ class Moments:
         self.store = store
         rows = store.connection.sql("FROM recordings").to_arrow_table().to_pylist()
         self._manifests = {row["recording_id"]: row for row in rows}
-        # Cached per recording: successive events are often of the same one.
+        # Cache results by recording, because successive events are often of the same recording.
         self._ends = cache(self._read_ends)
         self._walls = cache(self._read_walls)
         self._aligned: tuple[str, AlignedInputs | str] = ("", "")
@@ -141,7 +141,7 @@ class Moments:
         return {"cameras": {name: own for name, own in found.items() if own}, "notes": notes}
 
     def _times(self, event: Mapping[str, Any], window: pa.Table) -> list[float]:
-        """Return the times of steps in seconds, on the same zero as the event's `start_s`."""
+        """Return the times of steps (s) after the recording's first step, as in `start_s`."""
         stamps = window["logged_ns"].to_numpy()
         step = window["step_index"].to_numpy()
         own = stamps[np.searchsorted(step, event["first_step"])]
@@ -150,7 +150,7 @@ class Moments:
     def _poses(
         self, rows: pa.Table, window: pa.Table, recording: str, task: Task
     ) -> dict[str, Any]:
-        """Return the poses of the shown steps, the path around them, and walls near it."""
+        """Return the poses of the shown steps, the path around these steps, and the walls near."""
         poses = [numbers(window[name], 3) for name in ("pose_x_m", "pose_y_m", "pose_yaw_rad")]
         way = np.stack([floats(rows[name]) for name in ("pose_x_m", "pose_y_m")], axis=1)
         way = way[:: max(len(way) // 1_000, 1)]
@@ -201,9 +201,9 @@ class Moments:
     def _seen(
         self, manifest: Mapping[str, Any], task: Task, window: pa.Table, notes: list[str]
     ) -> dict[str, Any]:
-        """Return scan, plan and goal at each step.
+        """Return the scan, plan and goal at each step, read from the recording.
 
-        They are read from the recording. If that is not possible, scans come from the observations.
+        If the recording cannot be read, scans are taken from the observations.
         """
         stamps = window["stamp_ns"].to_numpy()
         aligned = self._align(manifest)
@@ -268,14 +268,14 @@ class Moments:
     def _rule(
         self, manifest: Mapping[str, Any], condition: Condition, rows: pa.Table, part: slice
     ) -> dict[str, Any]:
-        """Return a condition's definition, and the values of signals and terms in it."""
+        """Return a condition's definition, and the values of the signals and terms it uses."""
         steps = self._steps(manifest, rows)
         values = {
             name: rows[name]
             for name in rows.column_names
             if name in condition.words and _is_number(rows[name].type) and name[-3:] != "_ns"
         }
-        with suppress(ConfigError):  # a term may be text
+        with suppress(ConfigError):  # raised if a term is not a number
             terms = let_values(steps, condition)
             values |= {name: pa.chunked_array([pa.array(own)]) for name, own in terms.items()}
         return {
@@ -293,7 +293,7 @@ class Moments:
         }
 
     def _steps(self, manifest: Mapping[str, Any], rows: pa.Table) -> pa.Table:
-        """Return an episode's steps with its final step, as for evaluating conditions."""
+        """Return an episode's steps with its final one, from which conditions are evaluated."""
         ends = self._ends(manifest["recording_id"])
         if ends is None:
             return rows
@@ -359,7 +359,7 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 def _columns(window: pa.Table, names: Mapping[str, str]) -> dict[str, list[float | None]]:
-    """Return columns by title, without those that are unknown in all rows."""
+    """Return title -> values of the columns in `names`, without columns that are all unknown."""
     found = {title: numbers(window[name], 3) for title, name in names.items()}
     return {title: own for title, own in found.items() if any(v is not None for v in own)}
 

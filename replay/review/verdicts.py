@@ -26,8 +26,8 @@ from restock.ingest.relabel import RecordingCorrections
 from restock.ingest.store.manifest import Correction
 from restock.replay.store.store import Store
 
-_MOVED_S = 0.1  # largest difference of a step's time from the time in the file
-_MAX_PROBLEMS = 10  # largest number of a file's problems in the error message
+_MOVED_S = 0.1  # if a step's time differs by more from that in the file, its rows were replaced
+_MAX_PROBLEMS = 10  # largest number of problems that an error message lists
 _ROWS = """
 SELECT
     recording_id, ingest_id, episode_id, episode_index, step_index, logged_ns,
@@ -50,7 +50,7 @@ Step = Annotated[int, Meta(ge=0, le=999_999_999)]
 
 
 class Line(msgspec.Struct, frozen=True, kw_only=True):
-    """A verdict as written, before it is checked against the store."""
+    """A verdict as a person gave it, not yet checked against the store."""
 
     episode_id: str
     condition: str
@@ -58,7 +58,7 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     last_step: Step
     # yes, no, or FIRST..LAST (the steps in which it truly holds); empty: no verdict
     verdict: Annotated[str, Meta(pattern=r"^(yes|no|[0-9]{1,9}\.\.[0-9]{1,9}|)$")] = ""
-    start_s: float | None = None  # time of its first step when it was shown
+    start_s: float | None = None  # time of the first step, as it was shown to the person
 
     def ranges(self) -> list[tuple[int, int, bool]]:
         """Return ranges of steps: first, last, and whether the condition holds there."""
@@ -78,12 +78,12 @@ class Verdicts:
     given: dict[str, RecordingCorrections]  # recording id -> its corrections
     taken: int  # number of valid lines
     problems: dict[int, str]  # line number -> problem
-    left_open: int = 0  # lines of a file without a verdict
+    left_open: int = 0  # number of lines without a verdict
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """The rows of one episode with verdicts."""
+    """The rows of one episode to which verdicts were given."""
 
     recording_id: str
     ingest_id: str
@@ -93,7 +93,7 @@ class _Episode:
     recording_start_ns: int
 
     def rows(self, first: int, last: int) -> Ints:
-        """Return the row numbers of the steps from `first` to `last`."""
+        """Return the indices of the steps from `first` to `last`, both included."""
         return np.flatnonzero((self.step >= first) & (self.step <= last))
 
 
