@@ -12,7 +12,7 @@ n. A row cut short by truncation has a smaller n and bootstraps.
 
 from __future__ import annotations
 
-# Raised when packed rows or a panel's other columns change; part of a panel's id.
+# Raise this number when packed rows or a panel's other columns change. It is part of a panel's id.
 PACKING_VERSION = 6
 
 

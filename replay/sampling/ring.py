@@ -27,16 +27,16 @@ from restock.replay.sampling.rules import uniform_places
 from restock.state import Stateful
 
 NONE = -1
-_VICTIMS = 1024  # slots to overwrite that are chosen at a time
+_VICTIMS = 1024  # number of slots to overwrite that are chosen at a time
 
 
 class StratumSlots(Stateful):
     """Slots (0..capacity - 1) in disjoint strata, with constant-time moves and uniform draws.
 
-    When a slot leaves its stratum, the stratum's last slot takes its place, so members stay dense.
+    When a slot leaves its stratum, the stratum's last slot moves to its index: no gaps arise.
     """
 
-    # Draws within a stratum depend on the order of its members, so the order is kept.
+    # A checkpoint keeps the order of a stratum's slots, because draws depend on it.
     STATE: ClassVar[tuple[str, ...]] = ("_slots",)
 
     def __init__(self, capacity: int, strata: int) -> None:
@@ -48,7 +48,7 @@ class StratumSlots(Stateful):
     def move(self, slots: Ints, stratum: int) -> None:
         """Move distinct slots (n,) to a stratum, or out of all strata (-1)."""
         if stratum != NONE and (self.stratum[slots] == NONE).all():
-            self._add_all(slots, stratum)  # the usual case: labels of an ended episode
+            self._add_all(slots, stratum)  # usual case: an episode ended and got its labels
             return
         for slot in slots.tolist():
             old = int(self.stratum[slot])
@@ -107,7 +107,7 @@ class Reserve(Stateful):
     """Allocates the slots of a ring of `capacity` rows.
 
     Args:
-        strata: the slots of each condition; the ring updates it.
+        strata: the slots of each condition, which the ring keeps up to date.
         conditions: names of the conditions.
         reserved: condition -> number of its rows that rows of other conditions do not overwrite.
 
@@ -133,12 +133,12 @@ class Reserve(Stateful):
                 remedy="reserve rows for conditions of the ring, together at most its capacity",
             )
         self.capacity, self._strata = capacity, strata
-        self.appended = 0  # rows ever appended
-        self._serial: Ints = np.full(capacity, -1, np.int64)  # when each slot's row was appended
+        self.appended = 0  # number of rows ever appended
+        self._serial: Ints = np.full(capacity, -1, np.int64)  # `appended` before each slot's row
         self._victims: Ints = np.empty(0, np.int64)  # slots to overwrite next
 
     def take(self, count: int) -> Ints:
-        """Return slots (count,) for new rows, and clear the conditions of their old rows."""
+        """Return slots (count,) for new rows; slots to overwrite lose their condition."""
         beyond = max(self.appended + count - self.capacity, 0)
         if beyond and self.rows.any():
             beyond = min(beyond, count)
@@ -155,10 +155,10 @@ class Reserve(Stateful):
         return slots
 
     def _choose_victims(self, at_least: int) -> None:
-        """Choose the slots to overwrite next: the oldest of conditions above their reserve.
+        """Choose the slots to overwrite next: the oldest rows of conditions above their reserve.
 
-        If these are too few, for example before the first episode ends, add the oldest unlabelled
-        slots. If all rows in the ring are reserved, add the oldest of all.
+        If there are too few, for example before the first episode ends, add the oldest rows without
+        a label. If there are still too few, because all rows are reserved, add the oldest rows.
         """
         surplus = np.maximum(self._strata.counts - self.rows, 0)
         oldest = [np.empty(0, np.int64)]
@@ -185,31 +185,31 @@ class Reserve(Stateful):
 
 
 UNLABELLED = NONE
-_SLOT_ARRAYS = ("rows", "stratum", "draws")  # arrays with one entry per slot, besides META
+_SLOT_ARRAYS = ("rows", "stratum", "draws")  # arrays (capacity, …) besides those of META
 
-# Metadata of rows: name -> type of an array (capacity,).
+# Metadata of rows: name -> type of its array (capacity,).
 META: dict[str, type[np.generic]] = {
     "env_step": np.int64,  # environment steps of the run when the row's first step was taken
-    "gradient_step": np.int64,  # gradient steps of the run at that time
+    "gradient_step": np.int64,  # gradient steps of the run when that step was taken
     "policy_version": np.int64,  # the caller's number for the policy that acted
-    "behaviour_policy": np.int16,  # code into `behaviour_policies`
-    "action_probability": np.float32,  # of the action under that policy; NaN if unknown
-    "teacher_action": np.int16,  # the teacher's action; -1: not queried, or it has none
+    "behaviour_policy": np.int16,  # index in `behaviour_policies`
+    "action_probability": np.float32,  # probability of the action under that policy; NaN: unknown
+    "teacher_action": np.int16,  # the teacher's action; -1: none, or not queried
     "episode": np.int64,  # the episode's key
-    "episode_step": np.int32,  # of the row's first step in its episode, from 0
-    "horizon": np.int16,  # steps the row's return spans, 1..n_step
+    "episode_step": np.int32,  # number of the row's first step in its episode, from 0
+    "horizon": np.int16,  # number of steps that the row's return spans, 1..n_step
 }
 
 
 class PendingSteps(Stateful):
-    """A circular buffer of up to n steps per environment, with the oldest at `_first`.
+    """Steps whose n-step return is not complete, in a circular buffer per environment.
 
     Args:
-        num_envs: N.
-        observation_size: D.
+        num_envs: number of environments, N.
+        observation_size: numbers in an observation, D.
         discount: gamma of one step.
         n_step: steps of a return.
-        meta: a step's metadata: name -> type.
+        meta: name -> type of a step's metadata.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -234,7 +234,7 @@ class PendingSteps(Stateful):
         self._meta: dict[str, NDArray[Any]] = {
             name: np.zeros((num_envs, n_step), dtype) for name, dtype in meta.items()
         }
-        self.waiting: Ints = np.zeros(num_envs, np.int64)  # steps pending, 0..n_step - 1
+        self.waiting: Ints = np.zeros(num_envs, np.int64)  # number of pending steps, 0..n_step - 1
         self._first: Ints = np.zeros(num_envs, np.int64)  # position of the oldest step
         self._envs = np.arange(num_envs)
         self._ahead = np.arange(n_step)
@@ -347,27 +347,27 @@ class FreshRing(Stateful):
         self._reserve = Reserve(capacity, self.by_condition, self.conditions, reserved or {})
         self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)  # -1: in no stratum
         self.by_stratum = StratumSlots(capacity, len(self.strata))  # rows that `draw` may return
-        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)  # counted by `draw`
+        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)  # how often `draw` returned it
         self._pending = PendingSteps(
             num_envs, observation_size, discount=discount, n_step=n_step, meta=META
         )
-        # Slots written since a mirror of the rows last cleared this list; None: there is no mirror.
+        # Slots written since a copy of the rows elsewhere last cleared this list; None: no copy.
         self.written: list[Ints] | None = None
-        self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # of the current episodes
+        self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # keys of the current episodes
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
         self._next_key = num_envs
-        # The slot of each step of the current episodes, (N, T) with room for the longest.
+        # The slot of each step of the current episodes, (N, T); T grows with the longest episode.
         self._env_slots: Ints = np.full((num_envs, 256), NONE, np.int64)
         self._awaiting_labels: dict[int, Ints] = {}  # episode key -> slots of its steps
 
     @property
     def appended(self) -> int:
-        """Return the rows ever appended; if none are reserved, the next slot is this % capacity."""
+        """Return the number of rows ever appended (% capacity: next slot, if none is reserved)."""
         return self._reserve.appended
 
     @appended.setter
     def appended(self, rows: int) -> None:
-        """Set the count after `rows` was filled directly."""
+        """Set the number after the array `rows` was filled directly."""
         self._reserve.appended = rows
 
     def __len__(self) -> int:
@@ -458,12 +458,11 @@ class FreshRing(Stateful):
     def set_labels(
         self, episode_key: int, conditions: NDArray[Any], strata: NDArray[Any] | None = None
     ) -> int:
-        """Label the rows of an ended episode: `conditions[t]` (T,) is the code of its step t.
+        """Label the rows of an ended episode.
 
-        `strata` (T,) are the codes of its strata, -1 for no stratum; None: equal to `conditions`.
-
-        Returns how many of its rows were still in the ring. Raises MixtureError for an invalid
-        condition code, or a row without a label.
+        `conditions` (T,) are the condition codes of its steps, `strata` (T,) their stratum codes,
+        -1 for no stratum; None: equal to `conditions`. Returns how many of its rows were still in
+        the ring. Raises MixtureError for an invalid condition code, or a row without a label.
         """
         codes = np.asarray(conditions, np.int64)
         stratum_codes = codes if strata is None else np.asarray(strata, np.int64)
@@ -474,7 +473,7 @@ class FreshRing(Stateful):
             )
         slots = self._awaiting_labels.pop(int(episode_key), np.empty(0, np.int64))
         steps = np.arange(len(slots))
-        # Other slots were overwritten by rows of other episodes, or by later rows of this one.
+        # Skip slots that rows of other episodes, or later rows of this episode, have overwritten.
         present = slots >= 0
         present &= self.meta["episode"][slots] == episode_key
         present &= self.meta["episode_step"][slots] == steps
@@ -508,13 +507,13 @@ class FreshRing(Stateful):
         limit: int | None = None,
         since: int | None = None,
     ) -> Ints:
-        """Draw `counts` (S,) slots of each stratum, uniformly with replacement; return them, (n,).
+        """Draw `counts` (S,) slots of the strata, uniformly with replacement; return them, (n,).
 
         Args:
-            limit: largest number of draws of one row, checked after each call.
+            limit: a row that has been drawn so often is not drawn in later calls.
             since: earliest environment step of a row that may be drawn.
 
-        A stratum without rows that may be drawn is left out.
+        Nothing is drawn for a stratum without rows that may be drawn.
         """
         each = counts.tolist()
         at, begin = rng.random(sum(each)), 0
@@ -546,7 +545,7 @@ class FreshRing(Stateful):
 
     @property
     def _filled(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of filled slots: `rows` (n, W), others of _SLOT_ARRAYS and META."""
+        """Return the filled part, (n, …), of each array in _SLOT_ARRAYS and META, by name."""
         filled = len(self)
         meta = {name: values[:filled] for name, values in self.meta.items()}
         own = {name: getattr(self, name)[:filled] for name in _SLOT_ARRAYS}
@@ -567,13 +566,13 @@ class FreshRing(Stateful):
         )
 
     def restored(self) -> None:
-        """Rebuild the slots of unlabelled episodes after a checkpoint was loaded."""
+        """Find the slots of unlabelled episodes again after a checkpoint was loaded."""
         self._awaiting_labels = {}
         if self.conditions:
             self._find_slots()
 
     def _find_slots(self) -> None:
-        """Find the slots of unlabelled episodes from the rows' metadata."""
+        """Find the slots of unlabelled episodes by the metadata of their rows."""
         slots = np.flatnonzero(self.by_condition.stratum[: len(self)] == UNLABELLED)
         keys, steps = self.meta["episode"][slots], self.meta["episode_step"][slots]
         longest = max(256, 2 * int(steps.max(initial=0)), 2 * int(self._episode_step.max()))

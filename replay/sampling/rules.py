@@ -35,8 +35,8 @@ class StratumRows:
     """
 
     numbers: Ints  # (n,) row numbers in the panel
-    rng: np.random.Generator  # the sampler's, for shuffling before the first draw
-    prioritised: Prioritised  # the mixture's [prioritised]
+    rng: np.random.Generator  # the sampler's generator, for shuffling before the first draw
+    prioritised: Prioritised  # the mixture's table [prioritised]
     panel_column: Callable[[str], NDArray[Any]]
 
     def __len__(self) -> int:
@@ -48,7 +48,7 @@ class StratumRows:
 
 
 class StratumDraws(Stateful):
-    """Draws from the rows of one stratum; each rule is a subclass.
+    """Draws from the rows of one stratum; each rule is a subclass. Places number its rows from 0.
 
     `STATE` names the attributes that later draws depend on; a checkpoint keeps them.
     """
@@ -56,8 +56,8 @@ class StratumDraws(Stateful):
     def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, F32 | None]:
         """Return the places (count,) of the next rows and their importance weights (None: all 1).
 
-        One call draws the stratum's rows of several batches. `batches` is the number of batches
-        handed out before.
+        One call draws the stratum's rows for several batches. `batches` is the number of batches
+        that the sampler returned before.
         """
         raise NotImplementedError
 
@@ -92,7 +92,7 @@ class InTurns(StratumDraws):
         self._order: Ints = np.arange(len(rows))
         rows.rng.shuffle(self._order)
         self._cursor = 0
-        self._returned: Ints = np.empty(0, np.int64)  # rows given back; drawn first
+        self._returned: Ints = np.empty(0, np.int64)  # rows given back, to be drawn next
 
     def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, F32 | None]:
         parts, self._returned = [self._returned[:count]], self._returned[count:]
@@ -111,10 +111,10 @@ class InTurns(StratumDraws):
         self._returned = np.concatenate([places, self._returned])
 
 
-CHUNK = 16  # rows per sum of priorities: the search finds a chunk, then the row in it
+CHUNK = 16  # rows whose priorities are summed: a search finds a chunk, then the row in it
 BETA_BATCHES = 100_000  # batches after which the exponent of the weights is 1
 EPSILON = 1e-3  # added to |TD error|
-MEAN_OF = 32_768  # the mean weight of a larger stratum is estimated from at least so many rows
+MEAN_OF = 32_768  # in a larger stratum, the mean weight is estimated from at least so many rows
 
 _Fraction = Annotated[float, Meta(ge=0, le=1)]
 
@@ -133,13 +133,12 @@ class Prioritised(Checked, frozen=True):
 class Per(StratumDraws):
     """Draws rows by priority (|TD| + epsilon) ** alpha, with weights (n P) ** -beta of mean 1.
 
-    Schaul et al. divide weights by the largest. Here weights have mean 1 over a stratum's draws.
-    Then a stratum's share of the gradient is its quota, and a single row with a tiny priority
-    cannot shrink the steps of all other rows.
+    P is a row's priority over their sum. Schaul et al. divide weights by the largest one. With mean
+    1, a stratum's share of the gradient is its quota, and a single row with a tiny priority cannot
+    shrink the steps of all other rows.
 
-    A row that has not been drawn yet has the largest priority so far in its stratum, so that every
-    row gets drawn. The priorities are padded to a multiple of CHUNK with zeros, which are never
-    drawn.
+    A row that has not been used yet has the largest priority so far in its stratum, so that every
+    row gets drawn. Priorities are padded to a multiple of CHUNK with zeros, which are never drawn.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_priority", "_new", "_any_new", "_largest", "_stale_new")
@@ -150,9 +149,9 @@ class Per(StratumDraws):
         self._largest = float(self._raised(np.ones(1, np.float32))[0])
         self._priority: F32 = np.zeros(-(-self.size // CHUNK) * CHUNK, np.float32)
         self._priority[: self.size] = self._largest
-        self._new: Bools = np.ones(self.size, np.bool_)  # not drawn yet
+        self._new: Bools = np.ones(self.size, np.bool_)  # rows without a TD error so far
         self._any_new = True
-        self._stale_new = False  # new rows still have an earlier, smaller largest priority
+        self._stale_new = False  # whether `_largest` grew since new rows got it as priority
 
     @property
     def priority(self) -> F32:
@@ -184,7 +183,7 @@ class Per(StratumDraws):
         if self._stale_new and self._any_new:
             np.copyto(self.priority, np.float32(self._largest), where=self._new)
         self._stale_new = False
-        # einsum adds in the same order for any number of threads; BLAS may not.
+        # Unlike BLAS, einsum adds in the same order for any number of threads.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))
         places = self._search(sums, rng.random(count))
         places = places[rng.permutation(count)]
@@ -195,7 +194,7 @@ class Per(StratumDraws):
         return places, _weights(self._priority[places], self.priority, total, beta)
 
     def _search(self, sums: F32, within: F64) -> Ints:
-        """Return the place drawn in each of n equal parts, at offsets `within` (n,) in [0, 1)."""
+        """Return a place in each of n equal parts of all priorities, at offsets `within` (n,)."""
         ends = np.cumsum(sums, dtype=np.float64)
         at = (np.arange(len(within)) + within) * (ends[-1] / len(within))  # ascending
         places: Ints = np.empty(len(at), np.int64)
@@ -205,11 +204,11 @@ class Per(StratumDraws):
 
 
 def find_places(priority: F32, sums: F32, ends: F64, at: F64, out: Ints) -> None:
-    """Find places as the compiled function of that name does, in NumPy."""
+    """Find places like the compiled function `find_places`, but in NumPy."""
     chunk = np.minimum(np.searchsorted(ends, at, "right"), len(ends) - 1)
     rest = (at - (ends[chunk] - sums[chunk])).astype(np.float32)
     upto = np.ascontiguousarray(priority[chunk].T)  # (CHUNK, n)
-    # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
+    # Sum in a loop: for a matrix product, BLAS would wake its threads, which costs more.
     for before, current in itertools.pairwise(upto):
         current += before
     # The place in the chunk is the number of cumulative sums that are at most `rest`.
@@ -218,10 +217,10 @@ def find_places(priority: F32, sums: F32, ends: F64, at: F64, out: Ints) -> None
 
 
 def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
-    """Return (n P) ** -beta over its mean under P, for rows with priorities `drawn` (n,).
+    """Return (n P) ** -beta over its mean under P, for rows with priorities `drawn`.
 
-    In a large stratum, the mean is estimated from evenly spaced rows: a power for every row would
-    cost as much as everything else together.
+    In a large stratum, the mean is estimated from evenly spaced rows: to raise every priority to a
+    power would cost as much as everything else together.
     """
     some = np.ascontiguousarray(priority[:: max(len(priority) // MEAN_OF, 1)])
     mean = 1.0 if beta == 1.0 else float((some ** np.float32(1.0 - beta)).mean(dtype=np.float64))
@@ -231,7 +230,7 @@ def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
 
 @dataclass(frozen=True)
 class Rule:
-    """An entry of RULES: the class that draws, and properties that its users need."""
+    """An entry of RULES: a class that draws, and what its callers need to know."""
 
     draws: Callable[[StratumRows], StratumDraws]
     doc: str  # how rows are drawn, for reports

@@ -21,8 +21,8 @@ from restock.replay.sampling.rules import RULES, Prioritised, StratumRows, follo
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
-# Limits of the block if a rule draws by TD errors. A block is then a sixteenth of the rows, so that
-# few rows repeat before their new errors count; a larger panel costs more to sum per block.
+# Limits of the block, in batches, if a rule draws by TD errors. A block then has a sixteenth of the
+# rows: few rows are drawn twice before their new errors count, and summing priorities stays cheap.
 MIN_BLOCK, MAX_BLOCK = 8, 128
 
 
@@ -38,7 +38,7 @@ def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
             f"TD errors of shape {errors.shape} for rows of shape {np.shape(rows)}",
             remedy="give one for each row that was drawn, in their order",
         )
-    low, high = float(errors.min(initial=0.0)), float(errors.max(initial=0.0))  # pass NaN on
+    low, high = float(errors.min(initial=0.0)), float(errors.max(initial=0.0))  # NaN if any is
     if not math.isfinite(low + high):
         raise MixtureError(
             f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
@@ -55,10 +55,10 @@ def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
 class Quotas(Stateful):
     """Turns shares into whole rows per batch by largest remainder, carrying the rounding error.
 
-    Shares and batch size may change between batches; the carried rounding error is kept.
+    If shares or the batch size change between batches, the carried rounding error is kept.
 
     Args:
-        sizes: rows of each stratum (S,), to refuse a share for an empty stratum; None: no check.
+        sizes: rows of each stratum (S,), to refuse shares of empty strata; None: no check.
 
     Raises:
         MixtureError: shares do not form a distribution, an empty stratum has a share, or the batch
@@ -81,7 +81,7 @@ class Quotas(Stateful):
 
     @property
     def carry(self) -> F64:
-        """Return the rows that each stratum is still owed, (S,)."""
+        """Return how many rows each stratum is owed from earlier batches, (S,); may be negative."""
         return np.array(self._carry)
 
     @carry.setter
@@ -103,7 +103,7 @@ class Quotas(Stateful):
                 remedy="give it share 0, or let `restock mix` redistribute it",
             )
         total = given.sum()
-        # Shares that were scaled before stay the same to the last bit.
+        # Do not scale shares twice: they must stay the same to the last bit.
         return given if abs(total - 1.0) < 1e-12 else np.asarray(given / total)
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
@@ -134,7 +134,7 @@ class Quotas(Stateful):
         """Return the rows per stratum of the next batches, (n, S); each sums to the batch size."""
         if len(self.shares) == 1:
             return np.full((batches, 1), self.batch_size, np.int64)
-        # Plain lists: with a handful of strata, the overhead of NumPy calls dominates.
+        # Use lists: for a handful of strata, the overhead of NumPy calls dominates.
         mean, size, carry = self._mean, self.batch_size, self._carry
         strata = range(len(mean))
         quotas = []
@@ -147,7 +147,7 @@ class Quotas(Stateful):
                 for index in sorted(strata, key=rest.__getitem__, reverse=True)[:short]:
                     quota[index] += 1
                     rest[index] -= 1.0
-            for _ in range(-short):  # negative carries can leave the others a row too many
+            for _ in range(-short):  # negative carries can make the others' sum too large
                 index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
                 quota[index] -= 1
                 rest[index] += 1.0
@@ -165,9 +165,9 @@ class Quotas(Stateful):
 class QuotaSampler(Stateful):
     """Draws batches with exact quotas per stratum, and rows within a stratum by a rule of RULES.
 
-    A block of batches is drawn at a time, and handed out one by one. This reduces the cost of a
-    draw from about the cost of the gather to a tenth of it. Batches drawn ahead are part of
-    `state_dict`.
+    A block of batches is drawn at a time, and `draw` returns them one by one. A draw then costs a
+    tenth of gathering its rows; otherwise it would cost about as much. Batches drawn ahead are part
+    of `state_dict`.
 
     Args:
         stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
@@ -219,11 +219,11 @@ class QuotaSampler(Stateful):
             RULES[name].draws(StratumRows(rows, rng, numbers, column))
             for name, rows in zip(self.within, self._rows, strict=True)
         ]
-        self._batches = 0  # batches handed out
+        self._batches = 0  # number of batches that `draw` returned
         self._next = 0  # index of the next batch in the block
         none: Ints = np.zeros((0, self.batch_size), np.int64)
         self._ahead_rows, self._ahead_strata = none, none
-        self._ahead_places = none  # of the rows within their strata
+        self._ahead_places = none  # places of the rows within their strata
         self._ahead_weights: F32 | None = None
         self._learnt: list[tuple[Ints, F32]] = []  # rows and |TD errors| since the last block
         if self.follows_td:
@@ -251,7 +251,7 @@ class QuotaSampler(Stateful):
         return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """Take the |TD error| (n,) of rows (n,) just used in an update; used from the next block.
+        """Take the |TD error| (n,) of rows (n,) just used in an update, for the next block.
 
         Raises:
             MixtureError: a rule draws by TD errors, and an error is negative or not finite, or
@@ -283,7 +283,7 @@ class QuotaSampler(Stateful):
         self._pass_on_errors()
         quota = self.quotas.take(self.block)  # (block, S)
         strata = np.tile(np.arange(len(self.sizes)), self.block)
-        # Each stratum's rows of the whole block are drawn at once, then distributed to batches.
+        # Draw each stratum's rows for the whole block at once, then distribute them to batches.
         rows, places, weights = self._draw_all(quota.sum(axis=0))
         order = _block_positions(quota)
         self._ahead_rows = _scatter(rows, order).reshape(self.block, -1)
@@ -325,7 +325,7 @@ class QuotaSampler(Stateful):
         self._next = 0
 
     def _index_rows(self) -> None:
-        """Index the stratum and the place of each row number, for `update`."""
+        """Make arrays from row number to stratum and place, for `update`."""
         last = max((int(rows.max(initial=-1)) for rows in self._rows), default=-1)
         self._stratum = np.zeros(last + 1, np.int16)
         self._place = np.zeros(last + 1, np.int32)
@@ -344,7 +344,7 @@ class QuotaSampler(Stateful):
         super().load_state_dict(state)
 
     def _pass_on_errors(self) -> None:
-        """Pass the errors of a block to the rules at once: a call per batch would cost more."""
+        """Pass all new TD errors to the rules at once: a call per batch would cost more."""
         if not self._learnt:
             return
         rows, errors = map(np.concatenate, zip(*self._learnt, strict=True))
@@ -370,11 +370,11 @@ def _scatter(values: NDArray[Any], order: Ints) -> NDArray[Any]:
 
 
 def _block_positions(quota: Ints) -> Ints:
-    """Return the position of each drawn row in the block, (rows,).
+    """Return the position in the block of each drawn row, (rows,).
 
-    Rows are drawn stratum by stratum. A block is in order of batches, then strata.
+    Rows are drawn stratum by stratum. In a block, they are in order of batches, then of strata.
     """
-    begins = np.cumsum(quota).reshape(quota.shape) - quota  # (batches, S) where rows begin
+    begins = np.cumsum(quota).reshape(quota.shape) - quota  # (batches, S) first position in block
     counts = quota.T.ravel()
     return np.repeat(begins.T.ravel() - np.cumsum(counts) + counts, counts) + np.arange(
         counts.sum()
