@@ -15,7 +15,7 @@ from restock.ingest.steps.needs import angle_keys, beam_angles
 from restock.ingest.task.surroundings import outline_reach
 from restock.ingest.task.task import Body, Task
 
-BINS = 720  # bearings of a merged scan
+BINS = 720  # bins of bearing in a merged scan
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class SeenScan:
 
 @dataclass(frozen=True)
 class Seen:
-    """Scans, plans and goals at T ticks; None if the profile lacks the input or it is not fresh."""
+    """Scans, plans and goals at T ticks; None if the profile lacks the input or it is stale."""
 
     stamp_ns: Ints  # (T,)
     scans: list[SeenScan | None]
@@ -49,8 +49,8 @@ def seen_of(aligned: AlignedInputs, low_ns: int, high_ns: int) -> Seen:
 def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
     """Return the scan at each stamp.
 
-    It is as recorded, or if the profile has mounting positions of lidars, merged and converted to
-    the position of the body's lidar.
+    A scan is returned as recorded. If the profile has mounting positions of lidars, their scans are
+    merged into one scan, as seen from the position of the body's lidar.
     """
     scans = aligned.profile.inputs.scans
     if not scans or not scans.keys() <= aligned.inputs.by_name.keys():
@@ -65,7 +65,7 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
 def _from_the_middle(
     body: Body, sources: Sequence[Input], scans: Sequence[SeenScan | None]
 ) -> SeenScan | None:
-    """Merge the scans of several lidars at a tick: the nearest in each of BINS bearings."""
+    """Merge the scans of several lidars at a tick: take the nearest return in each of BINS bins."""
     nearest, stamp_ns = np.full(BINS, np.inf), [scan.stamp_ns for scan in scans if scan is not None]
     for source, scan in zip(sources, scans, strict=True):
         if scan is None:
@@ -120,7 +120,7 @@ def _goals(aligned: AlignedInputs, stamps: Ints) -> list[tuple[float, float] | N
 def sector_ranges(task: Task, observations: F32) -> tuple[F64, F64]:
     """Return the bearing of each sector, (S,), and the ranges in N observations, (N, S); inf: free.
 
-    Both are as seen from the lidar, with bearing 0 straight ahead. The task must have a lidar.
+    Bearings and ranges are seen from the lidar; bearing 0 is ahead. The task must have a lidar.
     """
     names = task.observation_names
     first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))

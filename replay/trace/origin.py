@@ -43,7 +43,7 @@ class MessageAtTick:
     log_time_ns: int
     publish_time_ns: int
     stamp_ns: int  # on the alignment clock
-    age_s: float  # at the tick; negative if the input may use a slightly later message
+    age_s: float  # age at the tick; negative if the message is a bit later and the input allows it
     max_age_s: float | None  # None: latched
     fields: dict[str, Any]  # field path -> value
 
@@ -109,7 +109,7 @@ def messages_at_tick(
     return sorted(named, key=lambda message: message.age_s)
 
 
-# Input, topic, maximum age, the topic's columns, the message's row in them, age, fields.
+# Input, topic, maximum age (s), columns of the topic, row of the message in them, age (ns), fields.
 _Message = tuple[str, str, float | None, TopicColumns, int, int, dict[str, Any]]
 
 
@@ -157,8 +157,8 @@ def _value(column: FieldColumn, row: int) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-# Range of log times around a tick in which its messages lie: topics have different rates, and some
-# messages take longer to be received.
+# Messages of a tick are searched in this range of log times around it: topics have different rates,
+# and some messages arrive late.
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
 # Long fields of a manifest that a trace leaves out.
@@ -175,7 +175,7 @@ _LEFT_OUT = (
 
 @dataclass(frozen=True)
 class StoreVersion:
-    """A store to search, at a version (None: the newest)."""
+    """A store in which a transition is looked up, and its version (None: the newest)."""
 
     path: str
     version: int | None = None
@@ -187,11 +187,11 @@ class Origin:
 
     transition: dict[str, Any]  # the row as stored
     store: dict[str, Any]
-    moment: dict[str, Any]  # its times, by stamp and by log time
+    moment: dict[str, Any]  # the row's times, as stamp and as log time
     reward_parts: dict[str, float] | None = None  # reward of each event in the step
     recording: dict[str, Any] | None = None  # the manifest of the ingest that wrote the row
     topics: list[dict[str, Any]] = field(default_factory=list)  # topics that the profile reads
-    messages: list[MessageAtTick] = field(default_factory=list)  # messages used at its tick
+    messages: list[MessageAtTick] = field(default_factory=list)  # messages used at the row's tick
     frames: list[dict[str, Any]] = field(default_factory=list)  # camera frames, with their file
     notes: list[str] = field(default_factory=list)
 
@@ -232,7 +232,7 @@ def find_origin(
 
 
 def _look_up(source: StoreVersion, transition: int) -> Origin | None:
-    """Return the row at that version; at the newest version if that one can no longer be read."""
+    """Return the row at the source's version, or at the newest if that cannot be read any more."""
     now = _read(StoreVersion(source.path), transition)
     if source.version is None:
         return now
@@ -250,7 +250,7 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
 
 
 def _read(source: StoreVersion, transition: int) -> Origin | None:
-    """Read a row with its manifest, frames and reward; None if it, or its version, is gone."""
+    """Read a row with its manifest, frames and reward; None if the row or version is gone."""
     try:
         with Store(source.path, version=source.version) as store:
             rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
@@ -295,7 +295,7 @@ def _frames(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return each camera's frame at a row, with its file, and notes on frames that are missing.
 
-    A later ingest replaces a recording's frames along with its rows.
+    Frames are missing if the recording was ingested again later, which replaces rows and frames.
     """
     kept = {one["camera"]: one for one in (manifest or {}).get("cameras") or []}
     if manifest is None or not kept:
@@ -421,7 +421,7 @@ def _reward_parts(
         np.array([row["action"]]),
         np.array([previous]),
     )
-    if task.reward_terms:  # computed as the rest, because they may need earlier steps
+    if task.reward_terms:  # the rest of the reward: computing terms may need earlier steps
         parts[" + ".join(task.reward_terms)] = row["reward"] - np.asarray(sum(parts.values()))
     return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
 

@@ -31,7 +31,7 @@ class Trace:
     """Everything known about one sampled row. Fields that do not apply are None; see `notes`."""
 
     audit: dict[str, Any] | None = None  # the row as it was sampled
-    episode: dict[str, Any] | None = None  # of a fresh row, with what generates it again
+    episode: dict[str, Any] | None = None  # a fresh row's episode, with the spec to drive it again
     panel: dict[str, Any] | None = None
     origin: Origin | None = None  # the row in a store
     notes: list[str] = field(default_factory=list)
@@ -77,7 +77,7 @@ def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None
 def listed_rows(place: str | Path, limit: int = 20) -> list[dict[str, Any]]:
     """Return a run's audited rows with the largest TD errors, or the most novel rows of a store.
 
-    In each dict, `row` is the argument for `trace_row`.
+    In each dict, `row` is the value to pass to `trace_row`.
     """
     run = Path(place)
     if not (run / RUN_CONFIG).is_file():
