@@ -33,9 +33,9 @@ class Topics:
     """Recordings whose topics are tables of a connection while this object exists.
 
     Args:
-        connection: gets a table for each topic that a query names. Its name is the topic's, and
-            also the topic's with `_` for inner slashes, if that is unique. The tables `topics` and
-            `columns` list them.
+        connection: gets a table for each topic that a query names. The table has the topic's name,
+            and a second name with `_` for inner slashes if that is unique. The tables `topics` and
+            `columns` list topics and their fields.
         path: a recording, a folder of recordings, or a glob.
         lost: called once for each loss: damage, or lost messages of a topic that was read.
 
@@ -193,12 +193,12 @@ class _Source:
         return self._schema.__arrow_c_schema__()
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return a stream of all its messages."""
+        """Return a stream of all messages of the topic."""
         reader = pa.RecordBatchReader.from_batches(self._schema, self._batches())
         return reader.__arrow_c_stream__()
 
     def _batches(self) -> Iterator[pa.RecordBatch]:
-        """Yield its messages; losses are reported at the end, or when a query ends early."""
+        """Yield the topic's messages; report losses at the end, or when a query ends early."""
         paths = [leaf.path for leaf in self._leaves]
         try:
             with open_recording(self._file, salvage=True) as recording:
