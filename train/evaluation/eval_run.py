@@ -204,7 +204,7 @@ def plan_evaluation(
         if is_cloned(name):
             cloned_panel(run, name)
         elif name == "agent" or _is_path("policies", name):
-            plan.loaded[name] = make_policy(name, plan)  # errors come before anything is driven
+            plan.loaded[name] = make_policy(name, plan)  # so that errors come before driving
     return plan
 
 
@@ -271,7 +271,7 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """Make a policy by name: the run's own, a reference, a clone, or a file's or other run's."""
+    """Make a named policy: the run's own, a reference, a clone, or that of a file or other run."""
     if name in plan.loaded:
         return plan.loaded[name]
     if name == "agent":

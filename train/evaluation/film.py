@@ -34,7 +34,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 FOLDER = Path("eval") / "films"  # relative to the run's folder
 DOCUMENT = "films.json"
 WORST, RESCUE = "worst failure", "rescue"
-RESCUED_FROM = ("planner", "cloned", "operator")  # failures to show if no other run's fits
+RESCUED_FROM = ("planner", "cloned", "operator")  # whose failures count if no other run failed
 OTHER_RUN = "run:"
 CAPTION_PIXELS, GAP_PIXELS = 44, 12
 MAX_FRAMES = 60

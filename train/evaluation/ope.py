@@ -143,7 +143,7 @@ class EssGate:
         )
 
     def measure(self, logged: OpeEpisodes) -> tuple[float, int]:
-        """Return the lowest effective number of episodes, and the first step with too few."""
+        """Return the lowest effective number of episodes, and the steps until it is too low."""
         if not len(logged):
             return 0.0, 0
         effective = effective_episodes(logged.ratio)

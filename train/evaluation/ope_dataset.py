@@ -263,7 +263,7 @@ def panel_store(panel: Panel) -> Store:
 
 
 def _exclude_trained(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
-    """Leave out episodes that have rows in the panel; return the other IDs and the number left out.
+    """Leave out episodes with rows in the panel; return the other row IDs and the number left out.
 
     An episode is also left out if it has a copy of one of the panel's rows under another ID.
     """

@@ -96,7 +96,7 @@ def load_policy(name: str, task: Task) -> Policy | None:
 
 
 def load_agent(run: Run) -> GreedyPolicy:
-    """Load the policy that a run drives with (`kept_policy`), as a greedy one.
+    """Load the policy that a run drives with (`kept_policy`) as a greedy policy.
 
     Raises:
         RunError: the run has made no update yet, its policy is missing or damaged, or the profile's
@@ -209,8 +209,8 @@ def write_mean(places: Sequence[Path], out: Path) -> GreedyPolicy:
 
     Independent runs have different errors, so their mean has smaller ones (arXiv:1611.01929). If
     the runs filter actions, the new run filters by the mean of their behaviour networks' logits. If
-    the planner taught them, the margin by which an action must beat its proposal shrinks like the
-    errors, by the root of the number of runs. The new run has no tables, as it was fed nothing.
+    the planner taught them, the margin by which actions must beat the planner's proposal shrinks by
+    the root of the number of runs, like the errors. The new run was fed nothing: it has no tables.
 
     Raises:
         RunError: the runs differ in more than their seeds, or one has no policy.
