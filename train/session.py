@@ -40,7 +40,7 @@ from restock.train.run.run import Run, RunLock
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
-_MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # by `train --resume`
+_MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # in a resumed run
 
 
 @dataclass

@@ -63,7 +63,7 @@ class Loss:
     """The loss of a batch, and the parts that the run records."""
 
     value: Tensor  # () float32, with gradient
-    td: Tensor  # (B,) float32, Q(s, a) - y, without gradient
+    td: Tensor  # (B,) float32, Q(s, a) minus the TD target, without gradient
     q: Tensor  # (B,) float32, Q(s, a), without gradient
     penalty: Tensor | None = None  # () float32, added to `value` for the gradient, not recorded
 

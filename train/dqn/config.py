@@ -99,7 +99,7 @@ class OptimizerConfig(Checked, frozen=True):
 class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
     logs_share: Share | None = None  # logged rows' share of online batches; None: the mixture's
-    ring_capacity: int = 100_000  # fresh rows kept
+    ring_capacity: int = 100_000  # most fresh rows that the ring holds
     ring_reserved: Share = 0.0  # share of the ring reserved for conditions, in equal parts
 
     def check(self) -> None:
@@ -112,7 +112,7 @@ class ReplayConfig(Checked, frozen=True):
 
 class ScheduleConfig(Checked, frozen=True):
     env_steps: NonNegativeInt = 200_000  # budget in steps, summed over all environments
-    seconds: Positive | None = None  # stop after this training time, if earlier
+    seconds: Positive | None = None  # budget of training time; the first budget to run out ends it
     offline_updates: NonNegativeInt = 2_000  # updates on the panel alone, before any driving
     warmup_env_steps: NonNegativeInt = 2_000  # rollouts before the first online update
     updates_per_env_step: Annotated[float, Meta(gt=0, le=1_000)] = 0.25
@@ -194,7 +194,7 @@ class EvaluationConfig(Checked, frozen=True):
 
 
 class RecordConfig(Checked, frozen=True):
-    every_updates: Count = 500  # length of a logging interval
+    every_updates: Count = 500  # updates per logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
     checkpoint_every_env_steps: Count = 40_000
     trackers: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ("tensorboard",)  # for curves

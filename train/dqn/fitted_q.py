@@ -79,7 +79,7 @@ def fitted_q(
         next_probability: (N, A) the policy's probability of each action in `next_observation`.
         discount: discount factor per step.
         bounds: lower and upper limit that TD targets are clipped to; None: no limits.
-        seed: of the initial weights and of the batches.
+        seed: seed of the initial weights and of the batches.
         between: called before every update; an exception that it raises ends the fit.
     """
     actions = next_probability.shape[1]

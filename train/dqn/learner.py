@@ -201,7 +201,7 @@ class Learner(Stateful):
         return Loss(loss.value.detach(), loss.td, loss.q)
 
     def _fill_by_kernels(self, rows: Tensor, terms: Terms) -> Loss:
-        """Fill the gradient by kernels, bit for bit the same, for DQN without CQL and margin."""
+        """Do what `_fill_gradient` does, bit for bit, by kernels: for DQN without CQL or margin."""
         parts = self._online, self._target, self.algorithm
         online, target, algorithm = cast("tuple[Kernel, Kernel, DQN]", parts)
         packed, count, size = rows.numpy(), len(rows), self.network.observation_size

@@ -140,7 +140,7 @@ class FeedRecord(Stateful):
         *,
         tail: Tensor | None = None,
     ) -> None:
-        """Keep the batch of gradient step `step` (from 1); of a random share of batches, audit it.
+        """Keep the batch of gradient step `step` (from 1), and audit it if it is in the sample.
 
         This runs inside the update loop, so it keeps only what is lost by the interval's end.
         `last_sync` is the update after which the target last moved; None if unknown. `tail` (B, 3)

@@ -91,7 +91,7 @@ class Batches(Stateful):
         self._rng = np.random.default_rng([seed, 1])
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
-        self._max_age: int | None = None  # of fresh rows, in environment steps
+        self._max_age: int | None = None  # maximum age of fresh rows, in environment steps
         # Number of logged rows in an online batch, its rounding error (added to the next number),
         # and the share behind it. The last quota of fresh rows is for rows of any stratum.
         self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
@@ -276,7 +276,7 @@ def _refuse_without_logs(loss: LossConfig) -> None:
 
 
 def _expert_mask(experts: Sequence[str], policy: Coded) -> Bools:
-    """Select the rows (n,) of these behaviour policies."""
+    """Select the rows (n,) that one of `experts` drove."""
     _refuse_unknown(experts, policy.names)
     return np.isin(policy.codes, [policy.names.index(name) for name in experts])
 

@@ -120,7 +120,7 @@ class Collector(Stateful):
         self._result: Any = None
         self._label: Label | int = UNKNOWN  # the teacher's actions in the current step
         self.perturbations = FreshPerturbations()
-        self.labels = EpisodeLabels()  # of ended episodes, until the record has used them
+        self.labels = EpisodeLabels()  # labels of ended episodes, until the record used them
 
     def check_conditions(self) -> None:
         """Raise ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
@@ -248,7 +248,7 @@ class Collector(Stateful):
         return finished
 
     def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
-        """Replace the row of a step whose physics diverged by the row before it."""
+        """Overwrite the row of a step whose physics diverged with a copy of the row before it."""
         ring = self.ring
         for key in keys[invalid]:
             slots = np.flatnonzero(ring.meta["episode"][: len(ring)] == key)

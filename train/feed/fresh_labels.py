@@ -81,7 +81,7 @@ class FreshPerturbations(Stateful):
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"_of": dict[int, tuple[str, str]]}
 
     def __init__(self) -> None:
-        self._of: dict[int, tuple[str, str]] = {}  # name, values as JSON
+        self._of: dict[int, tuple[str, str]] = {}  # key -> name, values as JSON
 
     def note(self, keys: NDArray[np.int64], names: Sequence[str], values: Sequence[str]) -> None:
         """Keep the names and values in force in the running episodes `keys` (N,)."""

@@ -77,9 +77,9 @@ class Logs:
     strata: list[str]
     timings: list[str]  # pre | post, of each stratum
     stratum_rows: list[Ints]  # the rows of each stratum
-    shares: NDArray[np.float64]  # (S,)
+    shares: NDArray[np.float64]  # (S,) share of each stratum in the drawn rows
     weights: F32 | None  # (n,) importance weights, or None if all are 1
-    as_of_ns: int  # reference time of ages in days
+    as_of_ns: int  # time up to which the ages of rows are counted
     transition_id: Ints  # (n,)
     stamp_ns: Ints  # (n,) when rows were logged; not when measured, which may be simulated time
     condition: Coded
@@ -87,7 +87,7 @@ class Logs:
     behaviour_version: Coded
     episode: Coded
 
-    perturbation: Coded | None = None  # of the twin; null for hardware
+    perturbation: Coded | None = None  # the twin's perturbation; null for rows from hardware
     panel: Panel | None = None  # the panel that the rows are from
     planned: PlannedDraws = _UNPLANNED  # the draws that the run plans
 

@@ -63,7 +63,7 @@ class Practice(Stateful):
         *,
         goal: bool = True,
     ) -> None:
-        """`goal` is whether success is defined."""
+        """Start counting; `goal` is whether the task defines success."""
         self.config, self._set = config, set_shares
         # Under the rule "natural", ordered missions count for the arms of their kind.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)

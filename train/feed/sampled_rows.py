@@ -35,7 +35,7 @@ _BATCH: dict[str, DTypeLike] = {
 LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: in the panel
 GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited log rows
 FRESH: dict[str, DTypeLike] = {
-    "condition": "i2",  # WAITING while its episode goes on
+    "condition": "i2",  # WAITING while the row's episode goes on
     "stratum": "i2",  # the mixture's stratum; without a mixture, the condition
     "episode": "i8",  # the ring's key
     "episode_step": "i4",
@@ -338,7 +338,7 @@ class SourceRows:
     condition: Ints
     conditions: Sequence[str]
     episode: Ints
-    episodes: Sequence[str] | None  # names of the codes in `episode`; None: they are keys
+    episodes: Sequence[str] | None  # names of the codes in `episode`; None: the codes are keys
     policy: NDArray[Any]
     policies: Sequence[str]
     ages: Mapping[str, F64]  # unit -> ages

@@ -270,7 +270,7 @@ _LOGS_SHARE = 0.25  # logged rows' share of an online batch if a teacher is quer
 
 
 def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
-    """Select the rows (n,) of these behaviour policies."""
+    """Select the rows (n,) that one of `policies` drove."""
     codes = [policy.names.index(name) for name in policies if name in policy.names[:-1]]
     return np.isin(policy.codes, codes)
 
@@ -350,7 +350,7 @@ class Imitation(Stateful):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # without "unknown"
             refuse_no_rows(config, names)
         self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
-        self._logged = 0  # rows of an online batch
+        self._logged = 0  # logged rows in an online batch
         if len(self._online.rows):
             self._logged = round(batch_size * _LOGS_SHARE) if config.queried else batch_size
 

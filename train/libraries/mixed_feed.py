@@ -245,7 +245,7 @@ class MixedFeed:
                 self._sampler.update(drawing.rows, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
-            self._close_interval()  # an interval has one phase
+            self._close_interval()  # because an interval has only one phase
             self._phase = phase
         self.batches += 1
         if self.record is None:
@@ -490,7 +490,7 @@ class FreshLabels:
     ) -> None:
         self.conditions: list[Condition] | None = None
         self.names = tuple(names)
-        self._enough = 1  # ended episodes to label at once
+        self._enough = 1  # ended episodes to wait for before labelling them
         if conditions is not None:
             self.conditions = sorted(conditions, key=lambda c: (c.priority, c.name))
             self.names = (*(condition.name for condition in self.conditions), NOMINAL)

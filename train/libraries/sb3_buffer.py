@@ -194,7 +194,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.pos, self.full = ring.appended % ring.capacity, ring.appended >= ring.capacity
 
     def _drop(self, key: int, step: int) -> None:
-        """Replace the row of a step whose physics diverged by the row before it."""
+        """Overwrite the row of a step whose physics diverged with a copy of the row before it."""
         meta, ring = self.ring.meta, self.ring
         rows = np.flatnonzero(meta["episode"][: len(ring)] == key)
         steps = meta["episode_step"][rows]

@@ -452,7 +452,7 @@ def run_clocks(run: Run) -> dict[str, Any]:
 
 
 def env_steps_of(run: Run) -> int:
-    """Return the environment steps of a run so far, the most in its checkpoint and tables."""
+    """Return the environment steps of a run so far: the largest in its checkpoint and tables."""
     steps: list[int] = [run_clocks(run).get("env_steps", 0)]
     for name in ("progress", "evaluations"):
         steps += run.table(name)["env_steps"].to_pylist()

@@ -188,7 +188,7 @@ def contrast(
 
 
 def _explain_no_interval(differences: F64) -> str | None:
-    """Return why `paired_t` gives no interval for paired differences (n,); None if it does."""
+    """Return why `paired_t` gives no interval for paired differences (n,); None if it has one."""
     if (seeds := len(differences)) < MIN_PAIRS:
         return f"{counted(seeds, 'seed')}, at least {MIN_PAIRS} are needed"
     return "the same in every seed: nothing varies" if nothing_varies(differences) else None
