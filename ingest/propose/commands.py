@@ -185,7 +185,7 @@ class CommandHold:
     """Evidence of how long a robot keeps following a command, in log time."""
 
     age_s: float | None = None  # None: unknown
-    stops_hold: bool = False  # whether the robot stands after a command to stop until the next one
+    stops_hold: bool = False  # whether a command to stop holds until the next command
     comments: tuple[str, ...] = ()
 
 
@@ -308,7 +308,7 @@ class CommandedDrive:
         row = np.maximum(index, 0)
         settled = (index >= 0) & fast[row]
         settled &= (self.odometry_ns - since_ns[row]) * 1e-9 >= SETTLED_S
-        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # command not old
+        settled &= (self.odometry_ns - self.command_ns[row]) * 1e-9 < SETTLED_S  # sent recently
         along = (measured * np.sign(reported[row]))[settled]
         return np.asarray(along[np.isfinite(along)], np.float64)
 
@@ -342,7 +342,7 @@ class Commands:
     measured: bool = False  # whether odometry is used as commands
     steered: bool = False  # whether commands contain the angle of the front wheels, as for a car
     wheelbase_m: float = 0.3
-    reached: tuple[float | None, float | None] = (None, None)  # robot's limits, m/s, rad/s
+    reached: tuple[float | None, float | None] = (None, None)  # limits found: m/s, rad/s
 
     @classmethod
     def of(cls, drives: Sequence[CommandedDrive], **known: Any) -> Commands:

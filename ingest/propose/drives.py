@@ -327,7 +327,7 @@ def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         clock=replace(
             base.clock,
             command_age_s=max(one.clock.command_age_s for one in (base, *driven)),
-            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base may use a rate
+            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base's may be new
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
@@ -418,7 +418,7 @@ def _advise_left_out(
     idle = [
         one.recording.path for one, t in zip(evidence, trials, strict=True) if not t.transitions
     ]
-    if idle and len(idle) < len(trials):  # all of them: see `problems`
+    if idle and len(idle) < len(trials):  # if all are idle, `problems` has it
         yield Advice(
             "name",
             f"{len(idle):,} of {len(trials):,} recordings give no transition: {names_of(idle)}",

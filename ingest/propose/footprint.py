@@ -271,7 +271,7 @@ def scanned_outline(
 
 
 def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
-    """Return the bearings (BINS,) of own parts: the range is the same wherever the robot faces."""
+    """Return the bearings (BINS,) of own parts: there, the range is the same for any heading."""
     facing = np.floor(yaw_rad / FACING_RAD).astype(np.int64)
     ways, counts = np.unique(facing, return_counts=True)
     ways = ways[counts >= MIN_A_FACING]

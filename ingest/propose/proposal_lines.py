@@ -392,7 +392,7 @@ def _input_lines(role: str, fits: Sequence[tuple[TopicInfo, Kind]], seen: Eviden
     return [*lines, "optional = true"] if role in FALLBACKS else lines
 
 
-GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # fastest curve that is careful on ice
+GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # speed and yaw rate of a careful curve on ice
 ROUTE_M = 20.0  # length of a route that the robot must be able to drive within the time limit
 MAX_TIME_LIMIT_STEPS = 1000
 MOSTLY_FREE = 0.1  # a topic that is "pressed" in a larger share of messages is no bumper

@@ -238,7 +238,7 @@ def propose_robot(
         middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
         found = described_robot(description, middle, scan.frame if scan is not None else "")
         if found.problem is not None:
-            unfit.append(f"{one.source}: {found.problem}")  # perhaps an arm
+            unfit.append(f"{one.source}: {found.problem}")  # it may describe an arm
             continue
         if one.check:
             notes.append(f"{one.source}: {one.check}")

@@ -201,7 +201,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 }
 # Used on request: the measured motion in place of commands that were not recorded.
 ODOMETRY_AS_COMMAND = _MEASURED
-# Message type -> the input that it fills, by which a robot's namespace is recognised.
+# Message type -> input, to recognise a robot's namespace. Odometry, also a pose, counts as wheels.
 _KIND_OF = {
     name: role
     for role in ("pose", "imu", "scan", "plan", "wheels", "command")
@@ -233,7 +233,7 @@ def robots_in(recording: Recording) -> list[str]:
     The robot to propose for is first: the chosen robot, or else a robot with a command and with
     topics of the most kinds.
 
-    Sibling namespaces are robots if topics of at least two kinds have the same names in them.
+    Sibling namespaces belong to robots if topics of at least two kinds have the same names in them.
     `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, belong to one robot.
     """
     kinds, messages = defaultdict[str, set[str]](set), Counter[str]()
