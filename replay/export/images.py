@@ -131,7 +131,7 @@ def pictures(
     for feature in features:
         files: dict[int, bytes] = {}
         small: list[NDArray[np.uint8]] = []
-        known: dict[int, tuple[bytes, NDArray[np.uint8] | None]] = {}  # cache of one
+        known: dict[int, tuple[bytes, NDArray[np.uint8] | None]] = {}  # caches the last frame
         for frame in camera_frames(store, ids, feature.camera):
             if frame.frame_index not in known:
                 known = {frame.frame_index: feature.picture(frame)}

@@ -123,7 +123,7 @@ def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[st
     """Return an episode's columns, (T,) or (T, k) each."""
     steps = np.arange(len(t))
     last = steps == len(t) - 1
-    chosen = t.carried.get(STATE)  # the query's state; unknown after the last step: no `next.`
+    chosen = t.carried.get(STATE)  # the query's state: without `next.`, unknown after the last step
     return {
         STATE: t.observations[:-1] if chosen is None else chosen.astype(np.float32),
         "action": t.actions,

@@ -245,7 +245,7 @@ def _with_frames(
 def _count_lost(
     connection: duckdb.DuckDBPyConnection, text: str, having: str, where: str, what: str = STATE
 ) -> int:
-    """Count the rows of query `text` that query `having` lacks; raise StoreError if it has none."""
+    """Count the rows of query `text` that query `having` lacks; raise StoreError if that is all."""
     counts = [
         fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]
         for one in (text, having)

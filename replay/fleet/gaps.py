@@ -45,7 +45,7 @@ class Yields:
     episode_id: list[str]  # (E,)
     hours: F64  # (E,)
     kind: list[str]  # (E,) kind of mission: the condition that the episode met, or nominal
-    simulated: bool  # some recordings are simulated, so that missions of a kind can be ordered
+    simulated: bool  # some recordings are simulated, so missions of any kind can be ordered
     # Columns: number (0..E - 1, the episode), condition (all that hold, separated by commas), zone,
     # action, robot, rows.
     cells: pa.Table
@@ -142,7 +142,7 @@ class Gap:
     """A cell or stratum with too few rows or episodes."""
 
     asked_by: str  # what requires it: "mixture coverage", "audit rare_condition", "--min-rows"
-    cell: dict[str, str | int]  # values of some of: condition (or stratum), zone, action, robot
+    cell: dict[str, str | int]  # value of any of condition (or stratum), zone, action, robot
     counted: Counted
     needed: float
     there: float
@@ -269,7 +269,7 @@ def _rank_zones(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
 def _find_audit_gaps(
     connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
 ) -> list[Gap]:
-    """Return the gaps to the thresholds of AUDITS, including closed ones, which lack nothing."""
+    """Return gaps between the store and the thresholds of AUDITS, also those that are closed."""
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(

@@ -218,8 +218,8 @@ def _forecasts(
 ) -> list[Forecast]:
     """Return forecasts for a gap: with the supply's zone and robot, without zone, and without both.
 
-    The caller uses the worst one. Otherwise, for a gap without a zone, the zone with the luckiest
-    sample would look best: its missions may count no more than missions anywhere.
+    The caller uses the worst one: for a gap without a zone, missions through one zone count no more
+    than missions anywhere. Otherwise, the zone with the luckiest sample would look best.
     """
     ways = (supply, Supply(supply.kind, None, supply.robot), Supply(supply.kind))
     return [one for way in dict.fromkeys(ways) if (one := table.get((index, way))) is not None]

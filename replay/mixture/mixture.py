@@ -62,7 +62,7 @@ class SourceShares(Checked, frozen=True):
 
     logs: Fraction = 0.5
     stores: tuple[OtherStore, ...] = ()
-    represents: Represents | None = None  # the same for the main store; never "archive"
+    represents: Represents | None = None  # rates that the main store's rows represent
 
     def check(self) -> None:
         _check_rates(self.represents)
@@ -139,14 +139,14 @@ class Safety(Checked, frozen=True):
     """Rows that must not be learned from."""
 
     unsafe: str  # SQL predicate over `transitions`
-    leave_out: Literal["rows", "episodes"] = "rows"  # "episodes": all rows of episodes with one
+    leave_out: Literal["rows", "episodes"] = "rows"  # "episodes": whole episodes with an unsafe row
 
 
 class CorrectionRule(Checked, frozen=True):
     """Importance weights that offset the boost of strata (drawn share over natural share)."""
 
     pre: Correction = "none"  # for strata selected by state: their boost does not bias Q
-    post: Correction = "density_ratio"  # for strata selected by outcome: their boost biases Q
+    post: Correction = "density_ratio"  # for strata selected by outcome: their boost would bias Q
     clip: FromOne = 4.0  # largest weight; "clipped" weights are also at least 1 / clip
     # What to do if weights take a stratum's share of the gradient below its share of the rows.
     below_natural: Literal["refuse", "allow"] = "refuse"
@@ -217,12 +217,12 @@ class Mixture(Checked, frozen=True):
     safety: Safety | None = None
     odometry_as_command: bool = False  # use rows whose action is measured motion
     max_age_days: Annotated[float, Meta(ge=0)] | None = None  # largest age of logged rows
-    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # ages are relative to it; None: now
+    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # date for ages; None: time of mixing
     max_age_env_steps: Count | None = None  # largest age of fresh rows
     max_rows_per_episode: AtLeastOne | None = None  # in each stratum
     max_rows_per_recording: AtLeastOne | None = None
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
-    uncertain: Uncertain = "nominal"  # labels: "nominal" ignores, "keep" uses them, "drop" the row
+    uncertain: Uncertain = "nominal"  # uncertain labels: ignore them ("nominal"), keep, or drop row
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # Shares of strata and sources.
     sources: SourceShares = SourceShares()

@@ -30,7 +30,7 @@ from restock.replay.mixture.mixture import (
 
 # Odds ratio of a condition in the episodes of one source to that in the others: from WARNING_ODDS,
 # warn of a possible archive; from ARCHIVE_ODDS, and ARCHIVE_EPISODES episodes with it, refuse the
-# source. A ratio of frequencies would not do: one above a fifth cannot become five times as large.
+# source. Not a ratio of frequencies: a frequency above a fifth cannot become five times as large.
 WARNING_ODDS, ARCHIVE_ODDS, ARCHIVE_EPISODES = 2.0, 5.0, 5
 Z_99 = 2.576  # half width of a normal distribution's 99 % interval, in standard errors
 

@@ -51,7 +51,7 @@ from restock.replay.plan.plan import AllStores, PanelPlan, PinnedStore, all_stor
 from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
-# Columns that a table with the columns of a store's `transitions` must have, whatever the mixture.
+# Columns that a table in the form of a store's `transitions` must have, whatever the mixture.
 _NEEDED = (
     *("transition_id", "recording_id", "episode_id", "episode_index", "step_index"),
     *("observation", "action", "reward", "next_observation", "terminated", "truncated"),

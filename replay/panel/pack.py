@@ -233,7 +233,7 @@ def n_step_horizon(continues: Bools, n_step: int) -> Ints:
     horizon = np.ones(len(continues), np.int64)
     unbroken = np.ones(len(continues), np.bool_)
     for ahead in range(1, min(n_step, len(continues) + 1)):
-        # The return of row i includes row i + ahead if it includes the row before, which continues.
+        # Row i's return includes row i + ahead if it includes the row before and that continues.
         step = np.zeros(len(continues), np.bool_)
         step[: len(continues) - ahead + 1] = continues[ahead - 1 :]
         unbroken &= step

@@ -177,7 +177,7 @@ class Header(msgspec.Struct, frozen=True):
     profile: str = ""  # name of the profile by which rows were ingested; "" if unknown
     profile_toml: str = ""  # text of that profile, in case its file is missing; "" if unknown
     as_of_ns: int | None = None  # moment that ages refer to; None without `max_age_days`
-    split_by: str = ""  # `by` of the evaluation split as it was done; "": as in the mixture
+    split_by: str = ""  # how the evaluation split was done, a value of `by`; "": as in the mixture
     split_note: str = ""  # what was held out instead of whole groups, or why nothing was
     warnings: list[str] = []  # the warnings of `restock mix`
 

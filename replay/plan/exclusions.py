@@ -24,12 +24,12 @@ from restock.replay.store.definitions import install_repeated_rows
 DAY_NS = 86_400 * 10**9
 # `by` of an evaluation split -> column and name of its groups. Other values use episodes as groups.
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
-# If one whole episode is more than this multiple of the share, only the end of one is held out.
+# If one whole episode is more than this multiple of the share, the end of an episode is held out.
 _WHOLE_AT_MOST = 2.0
 GAP_S = 2.0  # seconds left out before the held-out end of an episode
 _GAP_AT_MOST = 0.25  # largest fraction of an episode that the gap may take
 _LEFT_AT_LEAST = 0.2  # fraction of an episode's rows that must remain for learning
-EPISODE_REPEATS = 3  # an episode with so many rows that repeat the evaluation split is left out
+EPISODE_REPEATS = 3  # an episode is left out if this many of its rows repeat the evaluation split
 
 
 @dataclass

@@ -311,7 +311,7 @@ class RatioRows:
     action: Ints
     state_code: NDArray[np.int16]  # index of the stratum by the row's state alone, -1 for none
     code: NDArray[np.int16]  # index of the row's stratum
-    order: NDArray[np.uint64]  # hashes of ids; the rows to fit are those with the smallest
+    order: NDArray[np.uint64]  # hashes of ids; rows with the smallest are used for the fit
     rows_represented: F64  # see the function `rows_represented`
 
 

@@ -22,7 +22,7 @@ EDGE_STEPS = 2  # unlabelled steps this close to a labelled event are no missed 
 
 @dataclass(frozen=True)
 class DoubtfulEvent:
-    """Successive steps with a label, or that may lack it. Times are log time, UTC."""
+    """Successive steps with a label, or steps that may be a missed event. Times: log time, UTC."""
 
     event: str  # EPISODE/FIRST-LAST/CONDITION
     condition: str

@@ -150,7 +150,7 @@ class Moments:
     def _poses(
         self, rows: pa.Table, window: pa.Table, recording: str, task: Task
     ) -> dict[str, Any]:
-        """Return the poses of the shown steps, the path around these steps, and the walls near."""
+        """Return the poses of the shown steps, the path around these steps, and nearby walls."""
         poses = [numbers(window[name], 3) for name in ("pose_x_m", "pose_y_m", "pose_yaw_rad")]
         way = np.stack([floats(rows[name]) for name in ("pose_x_m", "pose_y_m")], axis=1)
         way = way[:: max(len(way) // 1_000, 1)]
@@ -293,7 +293,7 @@ class Moments:
         }
 
     def _steps(self, manifest: Mapping[str, Any], rows: pa.Table) -> pa.Table:
-        """Return an episode's steps with its final one, from which conditions are evaluated."""
+        """Return an episode's steps and its final step: conditions are evaluated from all."""
         ends = self._ends(manifest["recording_id"])
         if ends is None:
             return rows

@@ -134,7 +134,7 @@ class Reserve(Stateful):
             )
         self.capacity, self._strata = capacity, strata
         self.appended = 0  # number of rows ever appended
-        self._serial: Ints = np.full(capacity, -1, np.int64)  # `appended` before each slot's row
+        self._serial: Ints = np.full(capacity, -1, np.int64)  # serial number of each slot's row
         self._victims: Ints = np.empty(0, np.int64)  # slots to overwrite next
 
     def take(self, count: int) -> Ints:
@@ -347,11 +347,11 @@ class FreshRing(Stateful):
         self._reserve = Reserve(capacity, self.by_condition, self.conditions, reserved or {})
         self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)  # -1: in no stratum
         self.by_stratum = StratumSlots(capacity, len(self.strata))  # rows that `draw` may return
-        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)  # how often `draw` returned it
+        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)  # draws of each slot's row
         self._pending = PendingSteps(
             num_envs, observation_size, discount=discount, n_step=n_step, meta=META
         )
-        # Slots written since a copy of the rows elsewhere last cleared this list; None: no copy.
+        # Slots written since the owner of a copy of the rows cleared this list; None: no copy.
         self.written: list[Ints] | None = None
         self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # keys of the current episodes
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
@@ -510,7 +510,7 @@ class FreshRing(Stateful):
         """Draw `counts` (S,) slots of the strata, uniformly with replacement; return them, (n,).
 
         Args:
-            limit: a row that has been drawn so often is not drawn in later calls.
+            limit: a row that was drawn this many times is not drawn by later calls; None: no limit.
             since: earliest environment step of a row that may be drawn.
 
         Nothing is drawn for a stratum without rows that may be drawn.

@@ -166,8 +166,8 @@ class QuotaSampler(Stateful):
     """Draws batches with exact quotas per stratum, and rows within a stratum by a rule of RULES.
 
     A block of batches is drawn at a time, and `draw` returns them one by one. A draw then costs a
-    tenth of gathering its rows; otherwise it would cost about as much. Batches drawn ahead are part
-    of `state_dict`.
+    tenth of what gathering its rows costs; drawing batch by batch would cost about as much as
+    gathering. Batches drawn ahead are part of `state_dict`.
 
     Args:
         stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
