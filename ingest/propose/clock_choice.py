@@ -23,7 +23,7 @@ from restock.ingest.steps.clocks import STAMP
 
 FASTEST_S, SLOWEST_S = 0.08, 0.5  # limits of the proposed control period
 EVENTS_S = 0.2  # the control period if commands are not steady
-STEADY_S = (0.08, 0.5)  # if commands are this far apart, each one is a tick
+STEADY_S = (0.08, 0.5)  # if the median gap between commands is in this range, each one is a tick
 PAUSE = 5.0  # a gap longer than this multiple of the median gap is a pause in driving
 MAX_HOLD_S = 5.0
 MAX_OFF_CLOCK = 0.05  # largest share of a topic's messages that may be off the clock
@@ -57,7 +57,7 @@ class ClockChoice:
 
     alignment: str
     steps: str
-    period_s: float  # on the alignment clock
+    period_s: float  # control period, on the alignment clock
     max_gap_s: float
     command_age_s: float
     pace: float = 1.0  # seconds of the alignment clock per second of log time

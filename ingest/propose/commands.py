@@ -384,7 +384,7 @@ class Commands:
 def _reverse_speeds(back_mps: F64, most_mps: float) -> tuple[float, ...]:
     """Return the fastest reverse speed without outliers, at most `most_mps`.
 
-    Half of it is added if slow commands would otherwise be far from every action.
+    Half this speed is added if slow commands would otherwise be far from every action.
     """
     if not len(back_mps):
         return ()

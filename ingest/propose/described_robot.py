@@ -179,7 +179,7 @@ def _radius(link: ET.Element | None) -> float:
 
 
 def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
-    """Return the wheels that drive: large ones that do not swivel; [] unless on both sides."""
+    """Return the driven wheels: large, not swivelling; [] if they are not on both sides."""
     able = [
         wheel
         for wheel in wheels

@@ -90,7 +90,7 @@ def propose_profile(recording: Recording, name: str, given: Given | None = None)
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:
     """Propose a profile from gathered evidence, and try it on the evidence's recording.
 
-    With `goal_decided`, its goal is kept even if this recording alone has few goals in hindsight.
+    With `goal_decided`, the evidence's goal is kept even if hindsight finds few in this recording.
     """
     recording = seen.recording
     located = bool(seen.roles["pose"]) or seen.poses_from_frames
@@ -348,7 +348,7 @@ def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
 
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:
-    """Return the longest hold that any drive shows; a command to stop holds if all show it."""
+    """Return the longest hold of drives with evidence; stops hold if all these drives show it."""
     reported = [one for one in drives if one.comments]
     if not reported:
         return CommandHold()

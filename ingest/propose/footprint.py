@@ -57,7 +57,7 @@ class Footprint:
     width_m: float
     source: str  # where the outline is from, in words
     lidar_x_m: float | None = None  # ahead of the middle; None: unknown
-    lidar_y_m: float = 0.0  # to the left
+    lidar_y_m: float = 0.0  # to the left of the middle
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
     upside_down: bool = False  # whether the lidar is mounted upside down
@@ -319,7 +319,7 @@ _TURN = 2 * math.pi
 class SeenScans:
     """The frame and angles of a topic's scans."""
 
-    frame: str = ""  # of the first scan; "": unknown
+    frame: str = ""  # frame of the first scan; "": unknown
     angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last scan
 
     def view(

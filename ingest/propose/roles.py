@@ -237,7 +237,7 @@ def robots_in(recording: Recording) -> list[str]:
     `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, belong to one robot.
     """
     kinds, messages = defaultdict[str, set[str]](set), Counter[str]()
-    beside = defaultdict[tuple[str, str, str], set[str]](set)  # by parent, rest and kind
+    beside = defaultdict[tuple[str, str, str], set[str]](set)  # (parent, rest, kind) -> namespaces
     for name, topic in _readable(recording):
         other = topic.encoding in _OTHER_ENCODINGS
         if (kind := _KIND_OF.get(last_part(topic.type) if other else topic.type)) is None:

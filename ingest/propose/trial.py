@@ -26,7 +26,7 @@ OFTEN_INSIDE = 0.02
 MOVING, MIN_MOVING = 0.2, 30  # share of top speed above which a robot moves; ticks needed with it
 SLIP_OVER = "{0.2 m}"  # window of driving over which slip is measured, as in wheel_slip
 NOISE_IN_LIMIT = 1.25  # the limit of slip is this multiple of twice the noise
-EVEN_S = 3.0  # same length as the segments used to compare twin and log
+EVEN_S = 3.0  # length of a segment, as in the comparison of twin and log
 EVEN = 0.25  # largest deviation of an even tick, as a share of a control period
 UNEVEN = 4.0  # ticks per period are better if the twin can follow them this many times longer
 
@@ -35,7 +35,7 @@ UNEVEN = 4.0  # ticks per period are better if the twin can follow them this man
 class Advice:
     """The cost of a choice, and what to try."""
 
-    key: str  # of the profile, such as `inputs.command.max_age_s`
+    key: str  # a key of the profile, such as `inputs.command.max_age_s`
     text: str
 
     def __str__(self) -> str:
@@ -164,7 +164,7 @@ def _outline(
     if scan is None or scan.topic not in topics or not usable.any():
         return None, []
     clearance = steps.signals["clearance_m"][usable]
-    near_m = profile.task.rewards.tight_clearance_m  # as for near_collision and recovery
+    near_m = profile.task.rewards.tight_clearance_m  # also the limit of near_collision and recovery
     inside, near = float((clearance <= 0).mean()), float((clearance < near_m).mean())
     if inside <= OFTEN_INSIDE and near <= OFTEN_NEAR:
         return inside, []

@@ -202,7 +202,7 @@ class SharePlan:
     wanted: F64  # shares that the mixture wants, within floors and caps
     got: F64  # shares that the rows allow; they sum to 1
     scale: float  # fraction of a batch's logged rows that the rows suffice for
-    notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
+    notes: tuple[str, ...]  # why each stratum got less or more than it wants; "": it did not
 
 
 def plan_shares(

@@ -154,7 +154,7 @@ class Header(msgspec.Struct, frozen=True):
 
     id: str
     store: str  # absolute path or URL of the store; for a table in memory, a name with a hash
-    store_version: int  # of the store's Delta table; -1 for a table in memory
+    store_version: int  # version of the store's Delta table; -1 for a table in memory
     task_hash: str
     task_json: str  # "" if unknown
     labels_version: str

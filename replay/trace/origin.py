@@ -42,7 +42,7 @@ class MessageAtTick:
     type: str
     log_time_ns: int
     publish_time_ns: int
-    stamp_ns: int  # on the alignment clock
+    stamp_ns: int  # the message's time on the alignment clock
     age_s: float  # age at the tick; negative if the message is a bit later and the input allows it
     max_age_s: float | None  # None: latched
     fields: dict[str, Any]  # field path -> value
