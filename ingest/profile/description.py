@@ -69,7 +69,7 @@ class Description:
 
 
 def read_description(text: str) -> Description | str:
-    """Parse a description; return the reason as text if it cannot be used."""
+    """Parse a description; if it cannot be used, return the reason as text."""
     if len(text) > MAX_LETTERS:
         return f"{len(text):,} characters are too many for a robot's description"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -194,7 +194,7 @@ def lengths(text: str | None, count: int) -> F64:
 
 
 def number(text: Any) -> float:
-    """Parse a number of a description; an invalid one becomes NaN, so an outline is unknown."""
+    """Parse a number of a description; an invalid one becomes NaN and makes an outline unknown."""
     try:
         return float(text) if abs(float(text)) < 1e6 else float("nan")
     except (TypeError, ValueError):

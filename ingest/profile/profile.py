@@ -142,7 +142,7 @@ class Profile(Checked, frozen=True, dict=True):
         return [*self.conditions, *self.exposures]
 
     def shown_by_logs(self, conditions: Sequence[Condition]) -> list[Condition]:
-        """Return those of these conditions that this robot's logs suffice to evaluate."""
+        """Return those of `conditions` that can be evaluated from this robot's logs."""
         in_hindsight = self.goal_source == "hindsight"
         return reported(conditions, lidar=self.task.lidar, driven_plan=in_hindsight)
 
@@ -154,8 +154,8 @@ class Profile(Checked, frozen=True, dict=True):
     def hash(self) -> str:
         """Return a hash of everything in the profile that rows depend on, 12 hex digits.
 
-        Not hashed are conditions and their [noise], as changing them only relabels rows, which
-        have a `labels_version` for it; the [tags]; and the tables [robot] and [limiter].
+        Not hashed are the conditions and their [noise], as rows can be relabelled without the
+        recordings and have a `labels_version`; the [tags]; and the tables [robot] and [limiter].
         """
         values = _without_none(msgspec.to_builtins(self))
         rest = {key: value for key, value in values.items() if key not in _NOT_IN_ROWS}
@@ -170,7 +170,7 @@ class Profile(Checked, frozen=True, dict=True):
     def sources(self) -> dict[str, Input]:
         """Return all inputs by name, including `command_sources.NAME` and `command_through`.
 
-        These two kinds are optional, and so are goal and plan if the task has no goal.
+        Those two are optional, and so are goal and plan if the task has no goal.
         """
         optional = {
             name: msgspec.structs.replace(source, optional=True)
@@ -270,7 +270,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 
 def parse_profile(text: str, *, where: str) -> Profile:
-    """Parse a profile from TOML text without references to files; `where` is its name in errors.
+    """Parse a profile from TOML text that refers to no files; `where` names the profile in errors.
 
     Raises:
         ConfigError: the TOML is invalid.
@@ -281,7 +281,7 @@ def parse_profile(text: str, *, where: str) -> Profile:
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
     document = with_files(document, folder, where)
     signals = document.get("signals")
-    # Check each table on its own first: msgspec's errors in the whole do not name nested tables.
+    # Check each table alone first: msgspec's errors in a whole document leave out its name.
     for name, table in signals.items() if isinstance(signals, dict) else ():
         typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
     cameras = document.get("cameras")
@@ -295,7 +295,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
             raise ConfigError(what, where=where)
     profile = typed(document, Profile, where=where)
     if not profile.inputs.scans:
-        profile = without_lidar(profile)  # its task may still have a number of sectors
+        profile = without_lidar(profile)  # sets the task's number of sectors to 0, too
     check_profile(profile, where)
     return profile
 
@@ -304,7 +304,7 @@ def without_lidar(profile: Profile) -> Profile:
     """Return the profile without lidar: no scans and 0 sectors.
 
     Raises:
-        ConfigError: its task has tracks.
+        ConfigError: the profile's task has tracks.
     """
     if profile.task.tracks:
         raise ConfigError(
@@ -517,7 +517,7 @@ def _check_goal(profile: Profile, where: str) -> None:
 
 
 def _check_conditions(profile: Profile, where: str) -> None:
-    """Check that the SQL of the profile's own conditions, rewards and entries runs on steps."""
+    """Check that the SQL of own conditions, reward terms and observation entries runs on steps."""
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):

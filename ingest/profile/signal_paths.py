@@ -41,7 +41,7 @@ Rows = NDArray[np.intp]
 NAMES = "name"  # field that holds the elements' names, as in sensor_msgs/JointState
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
 _ELEMENT = re.compile(r"(.+)\[(\d{1,6})\]")
-IN = " in "  # between a path and the unit of its values
+IN = " in "  # separates a path and a unit: "twist.linear.x in km/h"
 UNITS = {  # unit that a field is stored in -> other allowed units -> factor to convert from these
     "mps": {"mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
     "radps": {"deg/s": math.pi / 180, "rpm": math.pi / 30},
@@ -95,7 +95,7 @@ class PathValues:
 
 @dataclass(frozen=True)
 class SignalPath:
-    """A parsed path. `text` is its original."""
+    """A parsed path; `text` is the path as written."""
 
     text: str
     steps: tuple[Step, ...]
@@ -105,7 +105,7 @@ class SignalPath:
         """Parse a path.
 
         Raises:
-            PathProblem: its syntax is invalid.
+            PathProblem: the path's syntax is invalid.
         """
         steps, at = [], 0
         while at < len(text):
@@ -153,8 +153,8 @@ class SignalPath:
         """Return the types (`float64`, `string`, …) of the path's values; `leaves` are all fields.
 
         Raises:
-            PathProblem: there is no such field, or it repeats and the path has no brackets for it,
-                or the reverse.
+            PathProblem: a field of the path is missing, or repeats but has no brackets in the path,
+                or has brackets but does not repeat.
         """
         kinds = {leaf.path: leaf.kind for leaf in leaves}
         repeats = {
@@ -195,7 +195,7 @@ class SignalPath:
             if step.choice is None:
                 continue
             parent, position, column = _open(column)
-            # Of the fields to compare, those in the element are flattened too, not a `name[]`.
+            # Fields to compare that lie inside the element are flattened like it; `name[]` is not.
             inside = {p for p in beside if p > place or (p == place and step.choice.key)}
             for other in inside:
                 beside[other] = _open(beside[other])[2]
@@ -470,7 +470,7 @@ _LAYOUTS = (  # FIELDS in ROS's type, in foxglove.FrameTransforms and in foxglov
     _FOXGLOVES,
 )
 FRAME_ID = "header.frame_id"
-FRAME_IDS = (FRAME_ID, "frame_id")  # in ROS messages, and in Foxglove's
+FRAME_IDS = (FRAME_ID, "frame_id")  # field that names the frame, in ROS and Foxglove messages
 
 
 def frame_path(source: Input, fields: Container[str]) -> str | None:

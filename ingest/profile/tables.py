@@ -133,7 +133,7 @@ class CustomSignal(Checked, frozen=True):
 
     topic: str
     type: str
-    path: str  # see `restock.ingest.profile.signal_paths`
+    path: str  # syntax: `restock.ingest.profile.signal_paths`
     unit: str  # "V", "m", "1", …
     max_age_s: Annotated[float, Meta(gt=0)] | None = (
         None  # None: latched, held until the next message
@@ -142,7 +142,7 @@ class CustomSignal(Checked, frozen=True):
     values: dict[str, float] | None = None  # maps texts, bools or numbers to numbers
     scale: float = 1.0  # stored value = value * scale + offset
     offset: float = 0.0
-    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # of a list; None: any length
+    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # length of lists; None: any
     doc: str = ""
 
     def check(self) -> None:
@@ -278,7 +278,7 @@ class Form(NamedTuple):
     """The names of fields that an input must or may have."""
 
     needs: tuple[str, ...] = ()
-    either: tuple[str, ...] = ()  # exactly one of these two is required, too
+    either: tuple[str, ...] = ()  # exactly one of these must be given, too
     may: tuple[str, ...] = ()  # optional
 
     @property
@@ -293,7 +293,7 @@ BY_FIX = Form(("latitude_deg", "longitude_deg"), may=("status", "covariance_m2",
 BY_RATES = Form(("speed_mps", "yaw_rate_radps"), may=("sideways_mps",))
 INPUT_FIELDS: dict[str, Form] = {
     "command": Form(("speed_mps",), _TURNS, ("sideways_mps",)),
-    "pose": Form(("x_m", "y_m"), _HEADING),  # or BY_FIX, or BY_RATES
+    "pose": Form(("x_m", "y_m"), _HEADING),  # other forms: BY_FIX, BY_RATES
     "heading": Form(either=_HEADING),  # only for a pose by fix
     "wheels": Form(("speed_mps", "yaw_rate_radps")),
     "imu": Form(("yaw_rate_radps", "accel_x_mps2")),
@@ -359,19 +359,19 @@ class Input(Checked, frozen=True):
     topic: str
     type: str
     fields: dict[str, str]  # name in `INPUT_FIELDS` -> path in the message
-    # Largest age of a message that a step uses; None: it holds until the next message.
+    # Largest age of a message that a step uses; None: a message holds until the next.
     max_age_s: Annotated[float, Meta(gt=0)] | None = None
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
     stop_holds: bool = False  # a command to stop holds until the next command, whatever its age
-    # For a lidar: whether scans run clockwise, seen from above; its position (ahead, left) from the
-    # middle of the outline, if not that of [task.body]; and the yaw of its zero angle.
+    # For a lidar: whether scans run clockwise, seen from above; the position (ahead, left) from the
+    # middle of the outline, if not that of [task.body]; and the yaw of the scans' zero angle.
     upside_down: bool = False
     lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
     lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
     # For a point cloud: the slice that `restock.ingest.steps.clouds` reads as a scan.
-    height_m: tuple[float, float] | None = None  # its lowest and highest height above the lidar
-    angle_rad: tuple[_Bearing, _Bearing] | None = None  # its first and last bearing; None: all
+    height_m: tuple[float, float] | None = None  # bottom and top of the slice above the lidar
+    angle_rad: tuple[_Bearing, _Bearing] | None = None  # first and last bearing; None: all
     # For a pose by latitude and longitude (`restock.ingest.steps.input_columns`).
     origin_deg: tuple[float, float] | None = None  # origin of the map; None: the first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # less certain fixes are unused; None: 5
@@ -396,7 +396,7 @@ class Inputs(Checked, frozen=True):
     pose: Input | None = None
     heading: Input | None = None  # for a pose by fixes; None: the direction of driving
     scan: Input | None = None
-    scan_2: Input | None = None  # further lidars; the nearest return of any of them counts
+    scan_2: Input | None = None  # further lidars; of all lidars, the nearest return counts
     scan_3: Input | None = None
     scan_4: Input | None = None
     imu: Input | None = None
@@ -471,7 +471,7 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
     """Check that the settings of all lidars are consistent.
 
     Raises:
-        ConfigError: they are not; names the key.
+        ConfigError: settings are inconsistent; names the key.
     """
     for name, source in scans.items():
         if source.lidar_yaw_rad is not None and source.lidar_at_m is None:
@@ -570,7 +570,7 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
     """Check that a source of commands has commands, or a button that is pressed while it drives.
 
     Raises:
-        ConfigError: it does not; names the key.
+        ConfigError: the source has neither; names the key.
     """
     commanding = source.fields.keys() - {"pressed"}
     if unknown := sorted(source.fields.keys() - {*COMMAND_SOURCE_FIELDS}):

@@ -23,7 +23,7 @@ from restock.errors import ConfigError, RecordingError
 from restock.toml import Checked
 
 NAMED = ("robot", "site", "firmware", "map", "shift")  # tags that are columns of the views
-MAX_TAGS = 64  # per recording
+MAX_TAGS = 64  # most tags of a recording
 MAX_NAME, MAX_VALUE = 64, 256  # longest name and value of a tag, in characters
 
 
@@ -81,7 +81,7 @@ def in_words(tags: Mapping[str, str]) -> str:
     return ", ".join(f"{name}={tags[name]}" for name in names)
 
 
-# One record of a recording's metadata: what errors call its source, its own name, its entries.
+# One record of metadata: its source as errors call it, the record's name, and its entries.
 Metadata: TypeAlias = "tuple[str, str, Mapping[str, str]]"
 _TAGS_TABLE = "`[tags]` of the profile"
 
@@ -198,11 +198,11 @@ def resolve_tags(
     """Determine the tags of one recording.
 
     Args:
-        rules: the rules of its profile.
-        path: its path.
-        metadata: its own metadata.
+        rules: the rules of the profile.
+        path: the recording's path.
+        metadata: the recording's metadata.
         given: tags from the command line, which override all others; an empty value removes a tag.
-        before: its tags in the store; a tag that no source mentions any more is kept.
+        before: tags that the store has of the recording; if no source mentions one, it is kept.
 
     Raises:
         RecordingError: two sources disagree, or no pattern matches the path, and `given` does not
@@ -262,7 +262,7 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def _part_pattern(part: str) -> str:
-    """Return the regular expression for one part of a path; it matches no empty part."""
+    """Return the regular expression for one part of a path, which must not be empty."""
     wild = {"*": "[^/]*", "?": "[^/]"}
     pieces = (
         f"(?P<{piece[1:-1]}>[^/]+?)" if piece[:1] == "{" else wild.get(piece, re.escape(piece))
