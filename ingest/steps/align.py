@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from restock.ingest.profile.tables import Clock
 
 NS = 1_000_000_000
-AHEAD_NS = 50_000_000  # a transform stamped later than its reception by more is timed by it
+AHEAD_NS = 50_000_000  # a transform stamped this long after its reception is timed by the latter
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # time of a simulation
 BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
 TOLERANCE_S = 0.1  # default tolerance of times: half a control period of .2 s
@@ -101,7 +101,7 @@ class ClockSegment:
 
 @dataclass
 class ClockReport:
-    """Findings about the clocks of a recording, stored with its counts."""
+    """Findings about the clocks of a recording, stored beside the recording's counts."""
 
     alignment: str
     offset_ns: int = 0  # log time minus stamp in the first segment
@@ -132,7 +132,7 @@ def align(
     Args:
         topics: in the order of log time; stamped topics have the field `header.stamp`.
         clock: the profile's choice of the alignment clock.
-        latched: topics whose messages are never left out, but put at their log time, as they may
+        latched: topics whose messages are put at their log time instead of left out, as they may
             have been published long before the recording began.
         transforms: topics of transforms, and cameras. They do not determine the clock's offset;
             if they are stamped ahead, they are timed by their reception.
@@ -352,7 +352,7 @@ def _rows_in(edges: Ints, index: int, columns: TopicColumns) -> Rows:
 
 
 def _sort(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
-    """Return samples in stamp order, sharing memory if they are in that order already."""
+    """Return samples in stamp order; if the input is in that order, they share its memory."""
     if (stamp_ns[1:] < stamp_ns[:-1]).any():
         order = np.argsort(stamp_ns, kind="stable")  # among equal stamps, the last received wins
         stamp_ns, row = stamp_ns[order], row[order]

@@ -238,7 +238,7 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
 
 
 def _command_topics(inputs: InputColumns) -> frozenset[str]:
-    """Return topics read only for commands, which take effect when they are received."""
+    """Return topics read only for commands: a command takes effect when it is received."""
     topics: dict[bool, set[str]] = {True: set(), False: set()}
     for name, source in inputs.by_name.items():
         commands = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
@@ -296,7 +296,7 @@ def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
 
 
 def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSegment]) -> None:
-    """Set `inputs.placed`, the poses of frames other than the fixed one that goals or plans use."""
+    """Set `inputs.placed`: poses of the frames of goals and plans that are not in the fixed one."""
     fixed = plain(tree.frames.fixed)
     for name in ("goal", "plan"):
         frames = np.array([*inputs.frames_of(name), None], object)[:-1]

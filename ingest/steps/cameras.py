@@ -65,7 +65,7 @@ class ImageLayout:
     width: int
     height: int
     channels: int
-    bits: int  # per channel
+    bits: int  # bits per channel
     row_bytes: int = 0  # bytes per row of a raw image; 0 for JPEG and PNG
     big_endian: bool = False
 
@@ -287,7 +287,7 @@ class CameraFrames:
 
     @property
     def problems(self) -> Counter[str]:
-        """Count the messages without an image that can be kept, by reason."""
+        """Count the messages that have no usable image, by reason."""
         words = np.asarray(self.columns.fields[PROBLEM], object)
         off = (words == "") & (self.stamp_ns < 0)
         counted = Counter([word for word in words if word])
@@ -345,7 +345,7 @@ class KeptFrames:
     frames: CameraFrames
     row: Ints  # (K,) ascending
     first: Ints  # (K,) first tick at which the frame is in force
-    last: Ints  # (K,) last tick at which it is
+    last: Ints  # (K,) last tick at which the frame is in force
     steps: int  # number of steps with a frame
 
     @classmethod

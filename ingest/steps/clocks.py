@@ -28,7 +28,7 @@ WIDE_NS = 100_000_000  # spread of (log time - stamp) from which `odd` reports i
 
 @dataclass(frozen=True)
 class TopicClock:
-    """Comparison of one topic's clocks. Values are None if its messages have no header stamp."""
+    """Comparison of one topic's clocks; values are None if messages have no header stamp."""
 
     topic: str
     messages: int
@@ -78,7 +78,7 @@ def topic_clock(topic: str, columns: TopicColumns) -> TopicClock:
 
 
 def odd(row: Mapping[str, Any]) -> str:
-    """Describe what is unusual about a topic's clocks, given its row; "" if nothing is."""
+    """Describe what is unusual in a row of `recordings.clocks`; "" if nothing is."""
     words = {
         "jumps": "jump",
         "log_backsteps": "log time backstep",
@@ -126,7 +126,7 @@ def jumps(log_time_ns: Ints, delay_ns: Ints, jump_ns: int) -> Ints:
     """Return the log times at which a topic's clock jumps, ignoring single bad stamps."""
     change_ns = np.diff(delay_ns)
     if not (np.abs(change_ns, out=change_ns) > jump_ns).any():
-        return np.zeros(0, np.int64)  # smoothed delays do not change by more than delays do
+        return np.zeros(0, np.int64)  # no jump: smoothing adds no larger change
     at = np.flatnonzero(np.abs(np.diff(smoothed(delay_ns))) > jump_ns) + 1
     return np.asarray(log_time_ns[at], np.int64)
 
@@ -225,10 +225,10 @@ def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
 
 
 def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
-    """Return the error of a map through N messages at messages between its knots, (N,) ns.
+    """Return the errors (N,), in ns, of a clock map at messages that it was not fitted to.
 
-    A map through every other message is compared with the rest, and the reverse. Empty for fewer
-    than 4 messages.
+    A map through every other of the N messages is compared with the rest, and the reverse. Empty
+    for fewer than 4 messages.
     """
     if len(log_ns) < 4:
         return np.zeros(0, np.int64)

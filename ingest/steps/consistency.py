@@ -45,7 +45,7 @@ class Finding:
 
     kind: str  # clock, sources, wheels, gyro, rates or order
     topic: str
-    what: str  # the contradiction, with its size
+    what: str  # the contradiction in words, with numbers
     steps: int  # number of ticks affected
     cause: str  # likely cause
     remedy: str

@@ -34,7 +34,7 @@ class CustomColumn:
 
     signal: CustomSignal
     values: Ragged  # (N,) lists; if the signal is not a list, each holds one value or none
-    unread: Sequence[str] = ()  # from each message with texts that are no numbers, one of them
+    unread: Sequence[str] = ()  # one text of each message that has texts that are not numbers
     unmeasured: int = 0  # number of messages that mark the signal as not measured
 
     @cached_property

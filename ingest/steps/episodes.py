@@ -62,7 +62,7 @@ class Steps:
     cameras: dict[str, CameraFrames] = field(default_factory=dict)
     clocks: list[TopicClock] = field(default_factory=list)  # one per topic that was read
     findings: list[Finding] = field(default_factory=list)  # contradictions between topics
-    notes: list[str] = field(default_factory=list)  # for the user
+    notes: list[str] = field(default_factory=list)  # notes for the user
     stand_ins: dict[str, str] = field(default_factory=dict)  # what replaces unmeasured inputs
 
     def __len__(self) -> int:
@@ -246,7 +246,7 @@ class _Walk:
         self.dropped: Counter[str] = Counter()
         self.stopped = protective_stop(task, steps).tolist()
         self.first: int | None = None  # first tick of the open episode
-        self.done_with: tuple[int, int] | None = None  # goal and order that were reached last
+        self.done_with: tuple[int, int] | None = None  # goal reached last, and its message
 
     def walk(self) -> Split:
         follows = self.steps.follows.tolist()

@@ -59,8 +59,8 @@ from restock.ingest.task.task_sql import Past, observed_in_log
 from restock.ingest.task.tracks import SECTORS as FINE_SECTORS
 from restock.ingest.task.tracks import Tracker
 
-# Larger numbers are faults, whatever the signal's unit. A position above it, stored as float32,
-# would not even resolve centimetres.
+# Larger numbers are faults, whatever the signal's unit. A position above this limit would not even
+# resolve centimetres when stored as float32.
 LARGEST = 1e6
 TOO_LARGE = "beyond a million"
 _CHUNK = 4096  # ticks processed at a time: bounds memory for recordings of any length
@@ -127,7 +127,7 @@ class Routing:
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:
         """Return by how much plan `plan[i]` became shorter from `now` to `after`, (N,).
 
-        Without a plan, return how far the robot moved forward, along the mean of its two headings.
+        Without a plan, return how far the robot moved forward, along the mean of both headings.
         """
         shorter: F64 = now["route_remaining_m"] - self.view(task, plan, after).remaining_m
         turn = after["pose_yaw_rad"] - now["pose_yaw_rad"]
@@ -150,7 +150,7 @@ def same_goals(goals_m: F64, moved_m: float) -> Ints:
 
 
 def plan_problems(plans_m: Sequence[F64]) -> list[str]:
-    """Return why each plan is unusable, whatever its goal; "" if it is not."""
+    """Return why each plan is unusable for any goal; "" if the plan is usable."""
     problems = []
     for plan in plans_m:
         if not len(plan):
@@ -369,7 +369,7 @@ class Filling:
     ) -> None:
         """Set signals from fields of a required input; an unusable value becomes 0.
 
-        `instead` replaces values without an estimate; if it is None, their ticks are unusable.
+        `instead` replaces values without an estimate; if it is None, such ticks are unusable.
         """
         latest = self._latest_required(name)
         for key, signal in signal_of.items():
@@ -421,7 +421,7 @@ class Filling:
             self.located = usable
             return
         tree = self.aligned.tree
-        assert tree is not None  # the profile is refused otherwise
+        assert tree is not None  # a profile without [inputs.pose] must have [frames]
         at = tree.place(tree.frames.base, self.aligned.ticks)
         self._mark_reasons("pose", at.problem)
         x, y = (at.translation_m[:, :2] - self.inputs.origin_m).T

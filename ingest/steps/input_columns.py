@@ -146,8 +146,8 @@ def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None =
 class FixedPoses:
     """Poses (N,) by fixes or dead reckoning; unknown values are NaN, possibly the yaw alone."""
 
-    x_m: F64  # to the east
-    y_m: F64  # to the north
+    x_m: F64  # east of the origin
+    y_m: F64  # north of the origin
     yaw_rad: F64  # from the east, counter-clockwise
     problem: NDArray[Any]  # (N,) why the pose is unknown, or ""
 
@@ -431,7 +431,7 @@ def _key(rule: Convention) -> str:
 
 
 def _flags(columns: TopicColumns, rule: Convention) -> Bools:
-    """Return which messages a convention marks, (N,); all False if they lack its fields."""
+    """Return which messages (N,) a convention marks; all False if its fields were not read."""
     if _key(rule) in columns.fields:
         return np.asarray(columns.fields[_key(rule)], np.bool_)
     if set(rule.fields) <= columns.fields.keys():  # read without the reduction
