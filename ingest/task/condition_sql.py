@@ -50,7 +50,7 @@ _GROWING = {
 _MORE_ROWS = {"unnest", "unlist"}
 _UNARY = {"lag", "lead", "first_value", "last_value", "nth_value", "ntile"}
 _WINDOWED = {*_UNARY, "row_number", "rank", "dense_rank", "rank_dense", "percent_rank", "cume_dist"}
-# Functions that use a time zone but are repeatable, as it is an argument or fixed by our session.
+# Functions that use a time zone but are repeatable: the zone is an argument, or fixed here.
 _ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
 # Aggregates whose result depends on the order of rows. That of window functions always does.
@@ -79,7 +79,7 @@ def sandbox() -> duckdb.DuckDBPyConnection:
     """
     import duckdb
 
-    atexit.register(sandbox.cache_clear)  # else nanobind warns that it outlives its module
+    atexit.register(sandbox.cache_clear)  # else nanobind warns that the database outlives it
     connection = duckdb.connect(config=SANDBOX)
     connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's time zone
     connection.execute("SET lock_configuration = true").fetchall()

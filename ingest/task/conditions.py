@@ -107,7 +107,7 @@ class Condition(Checked, frozen=True):
     kind: Kind = "outcome"
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
-        """Return the condition with those of a robot's constants that its SQL names.
+        """Return the condition with added `constants` of a robot: those that its SQL names.
 
         The condition's own constants take precedence. If `constants` has `control_period_s`, times
         such as `{1.6 s}` and distances such as `{0.2 m}` are replaced by numbers of steps.
@@ -124,7 +124,7 @@ class Condition(Checked, frozen=True):
 
     @property
     def words(self) -> set[str]:
-        """Return every word of its SQL, its `let`s and its probability."""
+        """Return every word in the condition's SQL, `let`s and probability."""
         expressions = (self.sql, self.probability, *self.let.values())
         return {word for text in expressions for word in re.findall(r"\w+", text)}
 
@@ -333,7 +333,7 @@ def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
     """Compute every `let` of a condition at each step, (N,); NaN for null.
 
     Raises:
-        ConfigError: its SQL does not run, or its values are not numbers.
+        ConfigError: the SQL does not run, or a value is not a number.
     """
     values: dict[str, F64] = {}
     for name in condition.let:

@@ -89,7 +89,7 @@ def missions(
     """Split a drive into missions.
 
     Args:
-        rules: how long the robot stands at a goal, and the longest distance to it.
+        rules: how long the robot stands at a goal, and the longest distance from start to goal.
         task: for its goal radius and time limit.
         xy_m: (T, 2) positions.
         stamp_ns: (T,) stamps of the ticks.
@@ -187,7 +187,7 @@ class _MissionCutter:
         goal = self._place(self.xy_m[end])
         gap = np.hypot(*(self.xy_m[start : end + 1] - goal).T)
         arrival = start + int(np.flatnonzero(gap <= self.radius_m)[0])
-        if (gap[arrival - start :] > self.shortest_m).any():  # it left again: end at arrival
+        if (gap[arrival - start :] > self.shortest_m).any():  # the robot left again: end at arrival
             end, why, last = arrival, "came back later", False
         number = len(self.goals)
         self.goals.append(goal)

@@ -50,7 +50,7 @@ USUAL_STEERING_RAD = 0.6  # default of max_steering_rad
 class Lidar(Checked, frozen=True):
     """The `[robot.lidar]` of a profile: height and beams, in the lidar's own frame.
 
-    Its position on the outline and its yaw are in `[task.body]`.
+    The lidar's position on the outline, and its yaw, are in `[task.body]`.
     """
 
     z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # height above the floor
@@ -112,7 +112,7 @@ class Robot(Checked, frozen=True):
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Return the radius of the axle's circle at full steering; 0 if it can turn in place."""
+        """Return the radius of the axle's circle at full steering; 0 for robots that turn in place."""
         if self.drive != "ackermann" or self.wheelbase_m is None:
             return 0.0
         return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)

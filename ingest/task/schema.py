@@ -423,7 +423,7 @@ def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
     return name, numbers
 
 
-# Order of precedence if a reader needs one true condition; others follow by name.
+# True conditions that a reader that needs only one prefers, in order; the rest follow by name.
 PRIMARY = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
 
 

@@ -185,20 +185,20 @@ class Body(Checked, frozen=True):
 TASK_CODE_VERSION = 2
 
 MAX_PERIOD_S = 10.0
-SLIP_MPS = 0.15  # slip is a larger difference to ground speed, at a top speed of 1 m/s or more
+SLIP_MPS = 0.15  # slipping wheels differ more from ground speed, at a top speed of 1 m/s or more
 
 
 class Rewards(Checked, frozen=True):
     """Reward of each event in a step: the `[task.rewards]` of a profile."""
 
-    progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m per step
+    progress_per_m: float = 1.0  # along the plan in force at t; at most +-1 m per step counts
     step: float = -0.02
     action_change: float = -0.01
     tight: float = -0.05  # if the clearance at t + 1 is below tight_clearance_m
     tight_clearance_m: float = 0.15
     harsh: float = -0.05  # if wheel speed changed faster than harsh_mps2
     harsh_mps2: float = 3.0
-    slip_per_mps: float = -0.1  # times |wheel speed - localised speed| above 0.2 m/s
+    slip_per_mps: float = -0.1  # for each m/s of |wheel speed - localised speed| above 0.2 m/s
     goal: float = 5.0
     bump: float = -6.0  # if a contact began; once per contact
 
@@ -223,7 +223,7 @@ class Task(Checked, frozen=True):
     rewards: Rewards = Rewards()
     # The profile's own reward terms: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
     reward_terms: dict[str, tuple[float, str]] | msgspec.UnsetType = msgspec.UNSET
-    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # own entries: name -> SQL
+    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # extra entries: name -> SQL
 
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
