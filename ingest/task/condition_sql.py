@@ -79,7 +79,7 @@ def sandbox() -> duckdb.DuckDBPyConnection:
     """
     import duckdb
 
-    atexit.register(sandbox.cache_clear)  # else nanobind warns that the database outlives it
+    atexit.register(sandbox.cache_clear)  # else nanobind warns that databases outlive the module
     connection = duckdb.connect(config=SANDBOX)
     connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's time zone
     connection.execute("SET lock_configuration = true").fetchall()

@@ -56,7 +56,7 @@ class Lidar(Checked, frozen=True):
     z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # height above the floor
     beams: Annotated[int, Meta(ge=4, le=720)] | None = None  # evenly spaced, from angle_min_rad on
     angle_min_rad: Annotated[float, Meta(ge=-7, le=7)] = -math.pi
-    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # full circle: no beam at the end
+    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # no beam here in a full circle
 
     def check(self) -> None:
         if not 0 < self.angle_max_rad - self.angle_min_rad <= 2 * math.pi + 1e-3:
@@ -112,7 +112,7 @@ class Robot(Checked, frozen=True):
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Return the radius of the axle's circle at full steering; 0 for robots that turn in place."""
+        """Return the smallest radius that the axle can drive; 0 if the robot can turn in place."""
         if self.drive != "ackermann" or self.wheelbase_m is None:
             return 0.0
         return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)

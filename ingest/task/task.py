@@ -159,10 +159,10 @@ class Noise(Checked, frozen=True):
     The SQL of conditions names them `lidar_noise_m`, and so on.
     """
 
-    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
-    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the distance between two poses, per axis
-    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the wheel speed
-    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # of the yaw rate, including bias
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # standard deviation of a range
+    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # error of the way between two poses, per axis
+    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # standard deviation of the wheel speed
+    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # deviation of the yaw rate, including bias
 
     @property
     def constants(self) -> dict[str, float]:
