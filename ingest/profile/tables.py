@@ -362,7 +362,7 @@ class Input(Checked, frozen=True):
     # Largest age of a message that a step uses; None: a message holds until the next.
     max_age_s: Annotated[float, Meta(gt=0)] | None = None
     optional: bool = False
-    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
+    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # axle distance, for steering_rad
     stop_holds: bool = False  # a command to stop holds until the next command, whatever its age
     # For a lidar: whether scans run clockwise, seen from above; the position (ahead, left) from the
     # middle of the outline, if not that of [task.body]; and the yaw of the scans' zero angle.

@@ -56,7 +56,7 @@ class AlignedInputs:
     tree: Tree | None = None  # None: the profile has no [frames]
     clock: ClockReport = field(default_factory=lambda: ClockReport(""))
     commands_between: int = 0  # commands without a tick of their own
-    notes: Sequence[str] = ()  # about unusual frames, and ignored parts of commands
+    notes: Sequence[str] = ()  # notes on unusual frames, and on ignored parts of commands
 
     def at(self, tick: int, stamp_ns: int) -> AlignedInputs | None:
         """Return the inputs at a single tick, or None if that tick is not at `stamp_ns`."""

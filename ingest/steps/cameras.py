@@ -162,7 +162,7 @@ def _jpeg(data: bytes) -> ImageLayout:
         if data[at] != 0xFF:
             break
         marker = data[at + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without a length field
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:  # a marker without length
             at += 1 if marker == 0xFF else 2
             continue
         if marker in _JPEG_FRAMES:
@@ -343,7 +343,7 @@ class KeptFrames:
 
     name: str
     frames: CameraFrames
-    row: Ints  # (K,) ascending
+    row: Ints  # (K,) index of each frame's message, ascending
     first: Ints  # (K,) first tick at which the frame is in force
     last: Ints  # (K,) last tick at which the frame is in force
     steps: int  # number of steps with a frame

@@ -22,7 +22,7 @@ BEAM_RAD = np.pi / 360  # angle between two beams
 _FIELDS = ("fields[].name", "fields[].offset", "fields[].datatype")
 _SHAPE = ("height", "width", "point_step", "row_step", "is_bigendian")
 CLOUD_PATHS = (*_FIELDS, *_SHAPE, "data")  # fields read of a sensor_msgs/msg/PointCloud2
-_FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
+_FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32 and FLOAT64 -> NumPy type
 
 
 def cloud_reduction(source: Input, range_min_m: float) -> Reduction:

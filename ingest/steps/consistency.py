@@ -30,7 +30,7 @@ STEPS_PER_WINDOW = 2 / 3  # share of a window's time that joined steps must cove
 BEYOND, BEYOND_MPS = 1.5, 0.1  # poses jump above BEYOND * fastest command or wheel + BEYOND_MPS
 OFTEN = 0.02  # share of the steps, or messages, from which a problem is reported
 SPIKE = 3.0  # a spike is above SPIKE * the fastest command or pose + SPIKE_MARGIN
-SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # as a robot may be carried
+SPIKE_MARGIN = {"speed_mps": 1.0, "yaw_rate_radps": 3.0}  # m/s, rad/s; a robot may be carried
 SPIKES = 0.1  # largest share of messages that are spikes; if more are, the scale is wrong
 MIN_STEPS = 5
 JUMP_M = 0.2  # a jump is this much farther than possible; less may be the localiser's noise
@@ -70,7 +70,7 @@ class Drive:
 
     signals: Signals
     joined: Bools  # (T,) whether this step and the one before are usable, without a gap or jump
-    seconds: F64  # (T,) since the step before; 0 if not joined
+    seconds: F64  # (T,) time since the step before; 0 if not joined
     window: Ints  # (T,) index of the step's window, which lasts WINDOW_S
 
     @classmethod

@@ -180,7 +180,7 @@ def _numbers(
 def _texts(values: NDArray[Any]) -> list[str]:
     """Convert values (V,) to a list of texts.
 
-    In a NumPy array, each text would take the memory of the longest.
+    A list, as in a NumPy array, each text would take the memory of the longest.
     """
     return [str(value) for value in (values if values.dtype.kind == "O" else values.astype(str))]
 
