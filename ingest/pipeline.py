@@ -78,12 +78,12 @@ class IngestResult:
     manifest: dict[str, Any]  # the row of `recordings`, as plain values
     messages: dict[str, int] = field(default_factory=dict)  # numbers of expected, decoded, unused
     conditions: dict[str, int] = field(default_factory=dict)  # label -> transitions it holds on
-    named: dict[str, int] = field(default_factory=dict)  # label -> rows with it as `condition`
+    named: dict[str, int] = field(default_factory=dict)  # label -> rows whose `condition` it is
     exposures: dict[str, int] = field(default_factory=dict)  # exposure -> transitions in it
     scores: list[LabelScore] = field(default_factory=list)
     endings: dict[str, int] = field(default_factory=dict)  # ending -> number of episodes
     lost_messages: list[str] = field(default_factory=list)  # lost messages or bytes, and why
-    contradictions: list[str] = field(default_factory=list)  # between topics; rows stay as read
+    contradictions: list[str] = field(default_factory=list)  # topics that disagree; rows unchanged
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # version of the table `transitions`, if this was committed
     repeats: RepeatedDrive | None = None  # a stored recording with largely the same rows

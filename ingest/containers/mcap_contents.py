@@ -59,8 +59,8 @@ class Contents:
     chunks: list[Chunk] = field(default_factory=list)
     loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
     definitions: Definitions = field(default_factory=Definitions)  # outside chunks
-    copies: Definitions = field(default_factory=Definitions)  # repeated in the summary
-    summary_proven: bool = False  # its CRC matches
+    copies: Definitions = field(default_factory=Definitions)  # definitions repeated in the summary
+    summary_proven: bool = False  # whether the summary's CRC matches
     statistics: Statistics | None = None
     data_end: tuple[int, int] = (0, 0)  # where the data section ends, and its CRC (0: unchecked)
     cut: Malformed | None = None  # where and why the walk ended early
@@ -90,7 +90,7 @@ class Contents:
 
     def distrust_index(self) -> None:
         """Drop the message indexes, so that every chunk is walked."""
-        # A chunk without an index stays the same object, as it may be `cut_chunk`.
+        # Do not copy chunks without an index: `cut_chunk`, which may be one, is found by identity.
         self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 

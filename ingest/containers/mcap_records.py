@@ -290,7 +290,7 @@ def indexed_messages(
     room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
     if (offset > room).any() or (size < HEAD_SIZE).any():
         return None
-    # From order of time to file order. No entry leaves its chunk, so `base` and `size` still fit.
+    # Sort by place in the file. Parts are in buffer order, so `base` and `size` still match.
     at = np.sort(offset.astype(np.int64) + base)
     head = gather(buffer, at, _HEAD)
     length = head["length"]

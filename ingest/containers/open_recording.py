@@ -128,7 +128,7 @@ def recordings_in(path: Path | str) -> list[Path]:
     path = recording_path(path)
     try:
         return _find_recordings(path)
-    except OSError as error:  # `path` itself is unreadable; such subfolders would be listed
+    except OSError as error:  # `path` cannot be read; an unreadable subfolder raises no error
         raise cannot_be_read(error, path) from error
 
 

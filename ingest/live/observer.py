@@ -38,7 +38,7 @@ _DELAYS = 200  # last delays of each topic, whose median is used
 class LiveClock:
     """Estimates the offset, log time less the robot's time, from messages in order of log time.
 
-    A message is off the clock if its log time less its stamp is over `jump_ns` from the offset.
+    A stamp disagrees with the clock if log time less stamp is over `jump_ns` from the offset.
     """
 
     def __init__(self, jump_ns: int) -> None:
@@ -47,7 +47,7 @@ class LiveClock:
         self._offset_ns: int | None = 0  # None: to be computed
 
     def receive(self, topic: str, log_time_ns: int, stamp_ns: int) -> bool:
-        """Return whether a message is on the clock; if so, use it for the offset."""
+        """Return whether a message's stamp agrees with the clock; if so, use it for the offset."""
         if not self.agrees(log_time_ns, stamp_ns):
             return False
         delays = self._delays_ns.setdefault(topic, deque(maxlen=_DELAYS))
@@ -56,7 +56,7 @@ class LiveClock:
         return True
 
     def agrees(self, log_time_ns: int, stamp_ns: int) -> bool:
-        """Return whether a stamp is on the clock; before the first message, every stamp is."""
+        """Return whether a stamp agrees with the clock; before any message, every stamp does."""
         away_ns = abs(log_time_ns - stamp_ns - self.offset_ns)
         return not self._delays_ns or away_ns <= self._jump_ns
 
@@ -83,8 +83,8 @@ class Observed:
 
     observation: NDArray[np.float32]  # (D,)
     stamp_ns: int  # time of the tick on the alignment clock
-    previous_action: int  # nearest to the command since the last tick; 0 (stop) if none came
-    problem: str  # why the robot must not act on it, or ""
+    previous_action: int  # action nearest to the command since the last tick; 0 (stop) if none
+    problem: str  # why the robot must not act on this observation, or ""
     signals: Signals  # at the tick, one row each; empty if nothing could be observed
 
 
@@ -122,8 +122,8 @@ class LiveObserver:
         for name, source in profile.inputs.items():
             if name not in PROVENANCE:
                 self._inputs.setdefault(source.topic, []).append(source)
-        self.left_out: dict[str, int] = {}  # topic -> messages off the clock
-        self.ahead: dict[str, int] = {}  # topic -> messages ahead of log time
+        self.left_out: dict[str, int] = {}  # topic -> messages whose stamp disagrees with the clock
+        self.ahead: dict[str, int] = {}  # topic -> messages whose stamp is ahead of log time
         self._max_ahead_ns = None if max_ahead_s is None else round(max_ahead_s * NS)
         self.reset()
 
@@ -237,7 +237,7 @@ class LiveObserver:
         return columns, Samples(stamps, np.zeros(len(stamps), np.intp))
 
     def _stamp(self, topic: str, message: Any, log_time_ns: int, latched: bool) -> int | None:
-        """Return a message's time on the alignment clock; None if it is refused, and count it."""
+        """Return a message's alignment time; None for a refused message, which is counted."""
         if self.profile.clock.alignment == "log_time":
             return log_time_ns
         received_ns = log_time_ns - self.offset_ns

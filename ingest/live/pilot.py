@@ -179,18 +179,18 @@ class Pilot:
 
 @dataclass(frozen=True)
 class Played:
-    """A decision at a recorded command."""
+    """A pilot's decision just before a recorded command."""
 
     log_time_ns: int
     decision: Decision
     took_s: float
-    drove: int | None  # the action nearest to that command; None if it cannot be read
+    drove: int | None  # the action nearest to the recorded command; None if unreadable
 
 
 def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
     """Play a recording in the order of log time; yield a decision just before its commands.
 
-    A command that comes less than 3/4 of a control period after the last decision gives none.
+    A command that comes less than 3/4 of a control period after the last decision gets no decision.
 
     Raises:
         RecordingError: it cannot be read, or has no commands.

@@ -98,7 +98,7 @@ class Profile(Checked, frozen=True, dict=True):
     behaviour_policy: str = "unknown"  # who drives, if no topic says so
     # Possible driver (a person, navigation) -> its own commands, before one driver is chosen.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
-    # If the robot smooths or limits the chosen driver's commands: their topic before that. The
+    # Topic of the chosen driver's commands, if the robot smooths or limits them afterwards. The
     # driver is then the one of `command_sources` whose command this topic repeats.
     command_through: Input | None = None
     clock: Clock = Clock()
@@ -127,7 +127,7 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def constants(self) -> dict[str, float]:
-        """Return the constants that the SQL of conditions may name beside the columns of steps."""
+        """Return named numbers that the SQL of conditions may use besides the columns of steps."""
         return self.noise.constants | self.task.condition_limits
 
     def _conditions_of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:

@@ -278,7 +278,7 @@ class Form(NamedTuple):
     """The names of fields that an input must or may have."""
 
     needs: tuple[str, ...] = ()
-    either: tuple[str, ...] = ()  # exactly one of these must be given, too
+    either: tuple[str, ...] = ()  # alternatives, of which exactly one must be given
     may: tuple[str, ...] = ()  # optional
 
     @property

@@ -99,7 +99,7 @@ def drivable(period_s: float) -> float:
     The twin divides a period into equal parts of at most 0.1 s, each a whole number of hundredths.
     """
     parts = int(np.ceil(round(period_s * 10, 6)))
-    # Also try one part less: 0.2015 s is nearer to 2 parts of 0.1 s than to 3 of 0.07 s.
+    # Also try one part fewer: 0.2015 s is nearer to 2 x 0.1 s = 0.2 s than to 3 x 0.07 s = 0.21 s.
     near = {
         count: round(period_s * 100 / count)
         for count in (parts - 1, parts)

@@ -308,8 +308,8 @@ def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     """Return the evidence of one drive, with the robot's properties combined from all drives."""
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max((base, *drives), key=lambda one: len(one.robot.values))
-    if base.commands.steered and not described.robot.described:  # use one wheelbase for all
-        described = base
+    if base.commands.steered and not described.robot.described:
+        described = base  # whose guess of the wheelbase also converted its steering commands
     # Prefer a measured outline to a guess, then an outline with a placed lidar, then the shortest
     # one: guesses come from the nearest return, so all of them are upper bounds.
     outlined = min(

@@ -179,7 +179,7 @@ def gather(recording: Recording, given: Given) -> Evidence:
     edges = transform_edges(recording)
     frames = transform_frames(recording, edges)
     if frames is not None and all(kind.by_fix for _, kind in roles["pose"]):
-        roles["pose"] = []  # unlike satellite fixes, transforms give the heading
+        roles["pose"] = []  # use transforms: unlike satellite fixes, they give the heading
     # If the only poses are odometry, which drifts, transforms to a map frame are better.
     drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
     framed = frames is not None and (on_map(frames) or not roles["pose"]) and drifts

@@ -238,9 +238,9 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
 def fix_noise_lines(
     recording: Recording, topic: str, fields: Mapping[str, str], driven_m: float
 ) -> list[str]:
-    """Write the limit of pose jumps and the noise of poses from satellite fixes.
+    """Return the profile's tables [episodes] and [noise], as lines, for poses by satellite fixes.
 
-    `driven_m` is how far the robot drives between two fixes.
+    `driven_m` is how far the robot may drive between two fixes.
     """
     usual = _usual_std_m(fixes_in(recording, topic, fields)) or 1.0
     return [

@@ -48,7 +48,7 @@ class Steps:
     route_problem: list[str]  # (T,) why the tick's goal or plan is unusable, or ""
     routing: Routing
     action: Ints  # (T,) index of the action nearest to the command
-    residual: F64  # (T,) distance of that action from the command, scaled as in `nearest_action`
+    residual: F64  # (T,) distance of the command from `action`, scaled as in `nearest_action`
     policy: list[str]  # (T,) name of the behaviour policy, which drives
     policy_version: list[str | None]  # (T,) the policy's version; None: unknown
     probability: list[float | None]  # (T,) the policy's chance to choose the action; None: unknown

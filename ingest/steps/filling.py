@@ -86,7 +86,7 @@ class Routing:
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
     def view(self, task: Task, plan: Ints, pose: Signals) -> RouteView:
-        """Find the points at `plan_distances_m` along plan `plan[i]`, seen from pose i of N."""
+        """View plans at `plan_distances_m` from N poses; `plan` (N,): index of each pose's plan."""
         count, at_m = len(plan), plan_distances_m(task)
         ahead = np.zeros((count, len(at_m), 2))
         ahead[:, :, 0] = at_m
@@ -103,7 +103,7 @@ class Routing:
         return RouteView(ahead, remaining, offset)
 
     def signals(self, task: Task, goal: Ints, plan: Ints, now: Signals) -> Signals:
-        """Compute the route's signals for N steps with `goal[i]` and `plan[i]` in force."""
+        """Compute the route's signals at N steps, from the indices `goal` and `plan` (N,) in force."""
         seen = self.view(task, plan, now)
         distance = np.zeros(len(goal))
         aimed = np.flatnonzero(goal >= 0)
@@ -243,7 +243,7 @@ class Filling:
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
         if lateral_by_poses is not None:
-            # Wheel speeds come from the poses, so localised speeds must equal them: no slip.
+            # Wheel speeds were computed from poses: other localised speeds would look like slip.
             forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
         scanned = {name: signals[name] for name in SCANNED}
@@ -482,7 +482,7 @@ class Filling:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
         source = self.inputs.by_name.get("bumper")
         if source is not None:
-            if source.max_age_s is not None:  # with None, a bumper publishes only changes
+            if source.max_age_s is not None:  # None: the bumper publishes only when it changes
                 self._latest_required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
             bumped = [

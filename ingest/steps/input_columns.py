@@ -247,14 +247,14 @@ class InputColumns:
         }
 
     def column(self, name: str, key: str) -> FieldColumn:
-        """Return a field of an input as decoded, without conversion to the unit of its key."""
+        """Return an input's field for `key` as decoded, without conversion of units."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
         return fields[path] if place is None else read_element(fields, source.fields[key])
 
     def numbers(self, name: str, key: str) -> F64:
-        """Return a field of an input in the unit of its key, one number per message, (N,)."""
+        """Return an input's field for `key`, one number per message (N,), in the unit of `key`."""
         if name == "pose" and key in ("x_m", "y_m"):
             return self._numbers(name, key) - float(self.origin_m["xy".index(key[0])])
         return self._numbers(name, key)
@@ -304,7 +304,7 @@ class InputColumns:
         return none
 
     def unestimated(self) -> Iterator[tuple[str, str, int, str]]:
-        """Yield (input, field, number of messages without an estimate of it, how they say so)."""
+        """Yield (input, field, number of messages marked as lacking an estimate, mark in words)."""
         for name, source in self.by_name.items():
             columns = self.topics[source.topic]
             rules = (rule for path in source.fields.values() for rule in _marks(source, path))
@@ -434,6 +434,6 @@ def _flags(columns: TopicColumns, rule: Convention) -> Bools:
     """Return which messages (N,) a convention marks; all False if its fields were not read."""
     if _key(rule) in columns.fields:
         return np.asarray(columns.fields[_key(rule)], np.bool_)
-    if set(rule.fields) <= columns.fields.keys():  # read without the reduction
+    if set(rule.fields) <= columns.fields.keys():  # fields were read, not flags
         return rule.flags(columns.fields)
     return np.zeros(len(columns), np.bool_)

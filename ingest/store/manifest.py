@@ -201,7 +201,7 @@ def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 
 def score_columns(scores: Sequence[LabelScore]) -> dict[str, Any]:
-    """Return a manifest's columns of label scores, and of their counts, which can be added up."""
+    """Return the manifest's label scores, and the counts behind them, which can be summed."""
     return {"label_scores": score_rows(scores), "label_counts": [asdict(one) for one in scores]}
 
 

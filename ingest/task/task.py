@@ -223,7 +223,7 @@ class Task(Checked, frozen=True):
     rewards: Rewards = Rewards()
     # The profile's own reward terms: name -> (weight, SQL); see `restock.ingest.task.task_sql`.
     reward_terms: dict[str, tuple[float, str]] | msgspec.UnsetType = msgspec.UNSET
-    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # extra entries: name -> SQL
+    observed: dict[str, str] | msgspec.UnsetType = msgspec.UNSET  # extra observations: name -> SQL
 
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):

@@ -28,8 +28,8 @@ class Drift:
     every: str  # length of a period: day, week, …
     reference: int  # number of a robot's first periods that are its reference
     least_episodes: int  # episodes that each side of a comparison needs
-    findings: Rows  # rows of the view drift_findings: changes, largest first
-    tests: Rows  # rows of the view drift: all comparisons
+    findings: Rows  # rows of the SQL view `drift_findings`: changes, largest first
+    tests: Rows  # rows of the SQL view `drift`: all comparisons
     periods: Rows  # robot, site, period, part, signal, recordings, episodes, p25, median, p75
     conditions: Rows  # robot, period, condition, driven_h, events, events_per_h
     notes: list[str]  # what could not be compared, and why

@@ -121,7 +121,7 @@ def _rows(first: Panel, second: Panel) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _strata(first: Panel, second: Panel) -> Rows:
-    """Return one row per stratum of either panel, as in a plan; null if a panel lacks it."""
+    """Return one row per stratum, with its figures in both panels; None for a panel without it."""
     sides = [{s.name: s for s in panel.strata} for panel in (first, second)]
     lines = []
     for name in dict.fromkeys([*sides[0], *sides[1]]):

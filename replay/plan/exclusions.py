@@ -94,9 +94,9 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
 
 @contextmanager
 def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -> Iterator[None]:
-    """Prepare `repeats_of` in a thread while the block runs.
+    """Install the SQL that `repeats_of` needs, in a thread beside the `with` block.
 
-    The block must not use the connection. Raises StoreError if manifests cannot be read.
+    The block must not use `connection`. Raises StoreError if manifests cannot be read.
     """
     if mixture.evaluation_split.is_empty:
         yield

@@ -283,7 +283,7 @@ class OutcomeModel:
         scaled = design[:, 1:]
         np.subtract(features, self.mean, out=scaled)
         scaled /= self.scale
-        # Clip features: observations unlike those of the fit must not give certain predictions.
+        # Clip features: predictions far outside the fitted observations must not be overconfident.
         np.clip(scaled, -5.0, 5.0, out=scaled)
         return design
 

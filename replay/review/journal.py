@@ -39,7 +39,7 @@ class Entry(Line, frozen=True, kw_only=True, tag="verdict", tag_field="kind"):
 
 
 class Applied(msgspec.Struct, frozen=True, tag="applied", tag_field="kind"):
-    """A record that verdicts were written into the store."""
+    """A journal line that says which verdicts were written into the store, and when."""
 
     ids: tuple[str, ...]
     version: int | None  # version of the store; None: no label changed

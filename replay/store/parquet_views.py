@@ -34,11 +34,11 @@ from restock.ingest.task.schema import DOCUMENTS
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
-# A file of a store in DuckDB's error messages.
+# Finds the path of a store's file in DuckDB's error messages.
 _FILE = re.compile(
     rf"""["'](?P<store>[^"']+)/(?P<file>(?:{TRANSITIONS}|{RECORDINGS}|{FRAMES})/[^"']+\.parquet)["']"""
 )
-# Errors by which DuckDB reports damage without naming the file.
+# Finds errors by which DuckDB reports damage without naming the file.
 _NAMELESS = re.compile(
     r"TProtocolException|[Dd]ecompress|[Tt]hrift|[Pp]arquet (?:file|page|reader)"
 )

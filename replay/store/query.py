@@ -234,7 +234,7 @@ def rows_of(
 
 
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
-    """Return the rows of a relation, with times that have a time zone as text in UTC."""
+    """Return the rows of a relation; times with a time zone become text in UTC."""
     if ZONED not in map(str, relation.types):
         return relation.fetchall()
     columns = [

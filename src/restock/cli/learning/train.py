@@ -210,7 +210,7 @@ def _print(prepared: Prepared, outcome: TrainResult, *, as_json: bool) -> None:
     if as_json:
         scores = asdict(outcome)
         for kept in (scores["best"], scores["last"]):
-            if kept is not None and not kept["success"]:  # the task has no goal
+            if kept is not None and not kept["success"]:  # empty if the task has no goal
                 kept["success_mean"] = None
         given = {"run": path, "panel": prepared.document["panel"], "fed": fed}
         print_json({**given, **scores})

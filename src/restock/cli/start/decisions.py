@@ -42,7 +42,7 @@ def edited(profile: Path | str | None, out: Path) -> bool:
 
 
 def several_kinds(kinds: list[Any], out: Path) -> Stop:
-    """Return a stop for recordings of several kinds of robots, with a command for each kind."""
+    """Build the `Stop` for recordings of several kinds of robots, with a command for each kind."""
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
     reported = [
         f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds
@@ -60,9 +60,9 @@ def several_kinds(kinds: list[Any], out: Path) -> Stop:
 
 
 def proposal(out: Path) -> tuple[list[str], str | None]:
-    """Return the recordings that a folder's proposal leaves out, and the one it was made from.
+    """Return the recordings that a proposed profile leaves out, and the recording it is based on.
 
-    It leaves out recordings of other kinds of robots, and recordings that could not be read.
+    Left out are recordings of other kinds of robots, and recordings that could not be read.
     """
     proposed = out / FOLDER / "propose.json"
     found = read_json(proposed) if proposed.is_file() else {}
@@ -71,7 +71,7 @@ def proposal(out: Path) -> tuple[list[str], str | None]:
 
 
 def stop_for_outline(checked: Document, profile: Path | str | None) -> Stop | None:
-    """Return a stop if the lidar sees something inside the robot's outline most of the time."""
+    """Return a `Stop` if the lidar sees something inside the robot's outline most of the time."""
     inside, task = checked.get("inside_outline"), _task(profile)
     if task is None or inside is None or inside <= INSIDE:
         return None
