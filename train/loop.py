@@ -241,7 +241,7 @@ def _run_updates(session: Session, count: int, phase: str, notify: Notify) -> No
 
 
 def _updates_to_make(session: Session, count: int) -> int:
-    """Return how many of `count` updates to make until the interval's end or the target's copy."""
+    """Return how many of `count` updates to make until a record or a copy to the target is due."""
     if session.blocks is None:
         count = 1 if session.batches.needs_td else min(count, LONGEST)
     step, rule = session.learner.gradient_steps, session.learner.target.rule

@@ -159,7 +159,7 @@ class Practice(Stateful):
         self._send_shares()
 
     def mismatch(self, name: str, value: Any) -> Exception:
-        """Return the error for a run that practised other arms."""
+        """Return the error for resuming a run whose arms (kinds of missions) were others."""
         return RunError(
             f"practised {', '.join(map(str, value or ()))}; now there are {', '.join(self.names)}",
             where=WHERE,

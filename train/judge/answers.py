@@ -373,7 +373,7 @@ NOISY_UNEXPLAINED = 0.4  # `UNEXPLAINED` for different quantities: driver and pl
 _KNOWN_GAIN = 0.3  # if the gain, relative to the twin's, is smaller, a delay means nothing
 HELD = 3  # consecutive steps of one action after which the motion counts as that action's
 _MIN_HELD = 15  # least rows that hold an action, to judge its motion
-_MIN_DISTANCE = 0.25  # a motion this far from its action's is odd; 1: the fastest action, by axis
+_MIN_DISTANCE = 0.25  # a motion is odd this far from its action's; 1: fastest action, per axis
 _MIN_SHARE = 0.8  # least share of an action's rows that must move like the same other action
 TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # (relation, rows left out) -> fit
 
@@ -393,10 +393,10 @@ class Answer:
 
     relation: Relation
     comparisons: list[Comparison]
-    gain: float  # ratio of the logs' to the twin's; NaN if unknown
-    delay: float  # the logs' less the twin's, in steps
+    gain: float  # factor from x to y in the logs, divided by the twin's; NaN if unknown
+    delay: float  # delay from x to y in the logs, less the twin's, in steps
     rows: FedRows | None = None  # of the logs; None if not comparable with other robots' rows
-    found: Response | None = None  # the logs' fit
+    found: Response | None = None  # the relation as fitted to the logs
     broken: Broken | None = None  # set if more stretches break than for other robots
 
     @property

@@ -111,7 +111,7 @@ def parts_of(logs: FedRows) -> tuple[list[Part], Comparison | None]:
 
 
 def _group_by_start(logs: FedRows) -> NDArray[np.str_]:
-    """Group recordings that started one after the other; return the group of each row, (N,).
+    """Sort recordings by start time, and group neighbours; return the group of each row, (N,).
 
     A group has at least `MIN_ROWS` rows, and more if there would be over `MOST` groups.
     """

@@ -317,8 +317,8 @@ _SAME = 1e-4  # two signals equal each other up to this difference, in m/s or ra
 _MIN_DRIVEN = 100  # least rows of a driver whose actions are counted
 _LESS = 0.9  # a robot's maximum is odd only below this share of the others' median
 _UNSEEN = 0.999  # lidar entries of at least this saw nothing
-_JUMP, _STILL = 0.15, 0.05  # a flicker differs by more from both neighbours, which differ by less
-_EXACT = 2e-3  # largest error of a reward that is the task's own
+_JUMP, _STILL = 0.15, 0.05  # a flicker is over _JUMP from both neighbours, these within _STILL
+_EXACT = 2e-3  # a reward differs from the task's own if it is off by more than this
 
 
 @dataclass(frozen=True)

@@ -85,10 +85,10 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     ends = odd_ends([one for one in answers if not _uses_end(one, shown)])
     one_to_one = len({row.note for row in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
-    # Late or early actions look permuted, too.
+    # Late or early actions look permuted, too. So do actions if the wheel signals are wrong.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
     changed = [one for one in of_rows if one.cause == CHANGED]
-    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown  # motion is measured at the wheels
+    shifted |= WHEEL_SPEED in shown or WHEEL_TURN in shown
     if not changed and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
         changed = [_permutation(moved, task)]
     if changed:
@@ -111,7 +111,7 @@ def _signal_findings(
     """Return the findings from signals' own values, and the signals that these explain."""
     causes = {one.cause for one in of_rows}
     if "EPISODES_REPEATED" in causes:
-        return [], ()  # repeated episodes repeat every value
+        return [], ()  # repeated episodes explain odd values of any signal
     if "LIDAR_OFF" in causes:
         off.pop(ZEROS + LIDAR, None)  # ranges that are too short become 0 near things
     by_end: dict[str, list[tuple[str, Comparison]]] = {}

@@ -146,7 +146,7 @@ def _verdict(run: Run, windows: Sequence[Window], figures: Window) -> tuple[Caus
 
 
 def _explain_youth(last: Sequence[Window], rule: TargetRule) -> str:
-    """Explain why the run may be too young to judge an L past its limit; "" if it is not.
+    """Explain why the run's youth may be the cause of its large lag L; "" if it cannot be.
 
     While values grow from 0, every target lags, but L falls with time. If L does not fall, the
     rule is too slow for any run to be old enough, and the rule is at fault.

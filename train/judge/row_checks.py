@@ -373,8 +373,8 @@ def _measure_approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     return np.asarray(slope - slope.mean(axis=1, keepdims=True))
 
 
-FAR = 0.25  # commands further than this from their action are far; 1 is the fastest action
-COARSE = 0.1  # largest share of far commands
+FAR = 0.25  # a command is far from its action beyond this distance; 1 is the fastest action
+COARSE = 0.1  # actions are too coarse if a larger share of commands is far from them
 DIFFERENT = 0.02  # largest share of wrong labels among rows that have, or should have, the label
 _LABELS = "row's label differs from what its conditions give on the stored signals"
 _FED = "row's label in the panel differs from that in its store"

@@ -82,10 +82,10 @@ LOW_PART = 0.5  # a warning is given if less than this part of a quota was fed
 
 
 def fed_shares(run: Run) -> list[dict[str, Any]]:
-    """Return a row per stratum: its natural, wanted, drawn and short share of all rows fed.
+    """Return a row per stratum, with its natural, wanted and drawn shares of all rows fed.
 
-    `logs_share` and `fresh_share` add up to the drawn share; `reason` is why the stratum was short.
-    The list is empty for a run without a panel.
+    `logs_share` and `fresh_share` add up to the drawn share. `short_share` is how much less than
+    wanted was drawn, and `reason` is why. The list is empty for a run without a panel.
     """
     sql = (files("restock.train.run") / "fed_shares.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:

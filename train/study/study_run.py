@@ -195,7 +195,7 @@ def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
 
 
 def _drive_references(plan: StudyPlan, say: Say) -> None:
-    """Drive the episodes of the runs with the planner and the operator, once.
+    """Evaluate the planner and the operator on the runs' episodes, unless that was done before.
 
     Their results are stored in the first run's directory.
     """

@@ -444,7 +444,7 @@ class FitProblem:
 
 
 def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
-    """Return the best points (best, n) among the base and `points` of a Sobol sequence."""
+    """Try BASE and `points` Sobol points; return the `best` ones of least cost, (best, n)."""
     from scipy.stats import qmc  # imported here because it is slow to import
 
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)

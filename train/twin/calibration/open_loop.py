@@ -491,9 +491,9 @@ def replay_segments(
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
-    """Return forward and lateral speeds (..., K + 1) from poses (..., W + K + 1, 3), as in ingest.
+    """Compute forward and lateral speeds (m/s), (..., K + 1), from each pose and the one before.
 
-    Without a warm-up, no pose precedes the first, so its speed is that of the wheels.
+    `pose` (..., W + K + 1, 3) has W warm-up steps; if W is 0, the wheels give the first speed.
     """
     stamp = np.broadcast_to(np.arange(pose.shape[-2]) * round(period_s * 1e9), pose.shape[:-1])
     columns = {name: pose[..., i] for i, name in enumerate(POSE)} | {"pose_stamp_ns": stamp}

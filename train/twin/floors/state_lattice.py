@@ -29,9 +29,9 @@ _ROUND_RAD = np.append(HEADINGS_RAD, 2 * np.pi)
 TOUCH_M = 0.06  # a pose whose outline comes nearer to anything is not free
 NEAR_M, NEAR_COST = 0.25, 2.0  # within NEAR_M, a step costs up to 1 + NEAR_COST times its time
 ARC = 0.35  # extra time of a turn while driving, as a share of the same turn on the spot
-OFF_COST_S = 0.5  # a state without a way takes its nearest neighbour's time, plus this per cell
+OFF_COST_S = 0.5  # a state with no way to the goal has the nearest state's time, plus this per cell
 _FIELD_M = 0.05  # cell size of the clearance field in which outlines are looked up
-_NO_WAY_S = 60.0  # time for all states of a heading, if none of them has a way
+_NO_WAY_S = 60.0  # time to the goal assumed for all states of a heading if none has a way to it
 BORDER_CELLS = 2  # width of the border along a window's sides where the floor continues
 ENTER_RAD = 0.6  # turn charged for entering the window: outside it, turning costs nothing
 

@@ -534,7 +534,7 @@ class Simulation(Stateful):
 
     @property
     def _physics(self) -> NDArray[Any]:
-        """Return the batch's own state, (N, …)."""
+        """Return the state of the physics of the batch's N robots, (N, …)."""
         state: NDArray[Any] = self.batch.state
         return state
 

@@ -398,7 +398,7 @@ def stamp(stamp_ns: int) -> Any:
 
 
 def _walk(message: Any, prefix: str, at: int, places: dict[str, Place]) -> int:
-    """Add the places of a message, from byte `at` or later, to `places`; return its end."""
+    """Write into `places` where a message's fields lie from byte `at` on; return the byte after."""
     if message.__msgtype__ == _TIME:
         at = _align(at, 4)
         places[prefix.removesuffix(".")] = Place(at, _STAMP, 1)

@@ -53,7 +53,7 @@ VERSIONS = {driver.name: driver.version for driver in (PlannerFollower, Operator
 BLOCK = 20  # missions drawn at a time, so that a short recording has every condition, too
 
 PAUSE_S = (4.0, 12.0)  # pause between missions, which is not recorded
-MAX_DRIVEN = 3  # maximum of missions driven per ordered mission, if some do not meet their kind
+MAX_DRIVEN = 3  # most missions driven per ordered one, as some do not meet the ordered kind
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Mission:
     driver: str  # planner, operator, random, or the name of a policy
     version: str
     handover: bool  # whether the operator takes over when the driver is stuck
-    pause_s: float  # before the next mission
-    order: int | None = None  # index of its order, if missions were ordered
+    pause_s: float  # pause before the next mission
+    order: int | None = None  # index in `MissionOrders.orders`; None: not driven for an order
 
 
 def schedule(
@@ -96,7 +96,7 @@ def schedule(
 
 
 class OrderedMissions:
-    """The missions of a file, in rounds until the ordered number of missions has met its kind.
+    """The missions of a file, in rounds until as many as ordered have met the ordered kind.
 
     A mission with pallets in an aisle may never get near them. So each round drives the missions
     still owed, shuffled; all rounds together drive at most MAX_DRIVEN times the ordered number.

@@ -358,7 +358,7 @@ def _pose(rows: F64) -> tuple[F64, F64, F64]:
 
 
 def _frame_between(inner: F64, outer: F64) -> F64:
-    """Return the frame (n, 3) in which poses `inner` (n, 3) are poses `outer` (n, 3)."""
+    """Return frame B's pose in frame A (n, 3), from a robot's poses: `inner` in B, `outer` in A."""
     yaw = outer[:, 2] - inner[:, 2]
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack(
