@@ -103,7 +103,7 @@ class Routing:
         return RouteView(ahead, remaining, offset)
 
     def signals(self, task: Task, goal: Ints, plan: Ints, now: Signals) -> Signals:
-        """Compute the route's signals at N steps, from the indices `goal` and `plan` (N,) in force."""
+        """Compute the route's signals at N steps; `goal` and `plan` (N,) are their indices."""
         seen = self.view(task, plan, now)
         distance = np.zeros(len(goal))
         aimed = np.flatnonzero(goal >= 0)
