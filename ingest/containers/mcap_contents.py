@@ -37,7 +37,7 @@ from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entri
 MAX_CHUNKS = 1_000_000
 MAX_NAMED = 10_000  # attachments and metadata records; further ones are only counted
 MAX_DAMAGED = 100
-FOOTER_BYTES = 20  # size of its content; the last 4: CRC of all from the summary's start to there
+FOOTER_BYTES = 20  # footer's size; its last 4: CRC of all bytes from the summary's start up to them
 TELL_EVERY = 65_536  # records between two calls of `watch`
 ROSBAG2 = "rosbag2"  # name of the metadata record of rosbag2's storage
 MAX_OTHERS = 1_000_000  # records whose kind is not in `_MANY`
@@ -275,7 +275,7 @@ class _Summary:
         self.definitions: list[tuple[int, int, int]] = []  # opcode, start, stop
         self.statistics: Statistics | None = None
         self.start = 0
-        self.proven = False  # its CRC matches
+        self.proven = False  # whether the summary's CRC matches
 
 
 def _read_summary(file: FileBytes) -> _Summary | None:

@@ -62,7 +62,7 @@ class LiveClock:
 
     @property
     def offset_ns(self) -> int:
-        """Return log time less the robot's time: the median of the topic with the least delay.
+        """Return log time less the robot's time: the smallest of the topics' median delays.
 
         It is 0 before the first message.
         """
@@ -131,7 +131,7 @@ class LiveObserver:
         """Discard all messages; needed if the clock was set or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._clock = LiveClock(round(JUMP_S * NS))
-        self._command: _Message | None = None  # first since the last tick; if none, an earlier one
+        self._command: _Message | None = None  # first since the last tick, else an earlier command
         self._ticked = True
         self._before_ns: int | None = None
         self._tracker = Tracker(self.task) if self.task.tracks else None

@@ -51,7 +51,7 @@ class Pilot:
 
     Args:
         policy: the policy, with its profile.
-        limits: of the limiter; None: no limiter, but an unknown input still stops the robot.
+        limits: those of the limiter; None: no limiter, but an unknown input still stops the robot.
         takeover_topic: a Bool that is true while a person drives; "": none. The profile's
             `command_sources` in OPERATORS count as well: a pressed button, or commands within the
             last ACTIVE_S.
@@ -77,7 +77,7 @@ class Pilot:
             self._people.append(Input(takeover_topic, BOOL, {"pressed": "data"}))
         self._active_ns: dict[str, int | None] = {}  # a person's topic -> when they last drove
         self._now_ns: int | None = None
-        self.counts: Counter[str] = Counter()  # of decisions, and of each kind of stop and limit
+        self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and limit
         self.unreadable: Counter[str] = Counter()  # topic -> messages of another type
         self._was_taken = False
         self.reason = "no decision yet"  # why the last decision was a stop, or ""

@@ -26,7 +26,7 @@ EVENTS_S = 0.2  # the control period if commands are not steady
 STEADY_S = (0.08, 0.5)  # if the median gap between commands is in this range, each one is a tick
 PAUSE = 5.0  # a gap longer than this multiple of the median gap is a pause in driving
 MAX_HOLD_S = 5.0
-MAX_OFF_CLOCK = 0.05  # largest share of a topic's messages that may be off the clock
+MAX_OFF_CLOCK = 0.05  # largest share of a topic's messages whose stamps may disagree with the clock
 
 
 @dataclass(frozen=True)

@@ -327,7 +327,7 @@ def pool_evidence(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         clock=replace(
             base.clock,
             command_age_s=max(one.clock.command_age_s for one in (base, *driven)),
-            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base's may be new
+            max_gap_s=max(one.clock.max_gap_s for one in (base, *driven)),  # base's gap may be new
         ),
         paces_s={
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)

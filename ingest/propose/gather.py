@@ -61,7 +61,7 @@ from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # smallest and largest radius of a goal
-MIN_ROWS = 100  # least rows with a goal in hindsight for which wanted goals are kept
+MIN_ROWS = 100  # wanted goals are kept if at least this many rows have a goal in hindsight
 
 
 @dataclass(frozen=True)

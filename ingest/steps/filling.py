@@ -103,7 +103,7 @@ class Routing:
         return RouteView(ahead, remaining, offset)
 
     def signals(self, task: Task, goal: Ints, plan: Ints, now: Signals) -> Signals:
-        """Compute the route's signals at N steps; `goal` and `plan` (N,) are their indices."""
+        """Compute the route's signals at N steps, given the index of each step's goal and plan."""
         seen = self.view(task, plan, now)
         distance = np.zeros(len(goal))
         aimed = np.flatnonzero(goal >= 0)
@@ -125,7 +125,7 @@ class Routing:
         }
 
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:
-        """Return by how much plan `plan[i]` became shorter from `now` to `after`, (N,).
+        """Return by how much each step's plan became shorter from `now` to `after`, (N,).
 
         Without a plan, return how far the robot moved forward, along the mean of both headings.
         """
@@ -238,7 +238,7 @@ class Filling:
         signals, routing = self.signals, self.routing
         signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
         self._find_breaks()
-        before = np.arange(len(self.follows)) - self.follows  # index of the tick before, or of this
+        before = np.arange(len(self.follows)) - self.follows  # index of the tick before or itself
         forward, lateral = localised_velocity(
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
@@ -453,7 +453,7 @@ class Filling:
         """Lower the clearances `sectors` (T, K) to those of one lidar; NaN is not yet known."""
         latest, count = self._latest_required(name), len(self.tick_ns)
         fields: Fields = self.inputs.topics[source.topic].fields
-        if SECTORS not in fields:  # the topic was read without its reduction
+        if SECTORS not in fields:  # scans were read, but not reduced to sectors
             fields = scan_reduction(self.task, source).apply(fields)
         if near := int(np.asarray(fields[CLOSE]).sum()):
             self.notes.append(

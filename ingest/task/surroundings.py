@@ -43,7 +43,7 @@ class SectorMap:
     order: NDArray[np.intp] | slice  # (B,) beams sorted by sector; a slice if they already are
     starts: NDArray[np.intp]  # (filled,) first position of each non-empty sector in `order`
     filled: NDArray[np.intp]  # (filled,) the sectors that have beams
-    reach_m: NDArray[np.float64]  # (B,) from the lidar to the outline along the beam
+    reach_m: NDArray[np.float64]  # (B,) distance from the lidar to the outline along the beam
 
     @classmethod
     def build(cls, bearings_rad: NDArray[Any], sectors: int, body: Body) -> SectorMap:

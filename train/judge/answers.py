@@ -384,7 +384,7 @@ class Broken:
 
     off_by: float  # root mean square error in these stretches, in the unit of y
     usually: float  # root mean square error in all stretches of the other robots
-    mended: dict[str, tuple[float, float]]  # cause -> (share that holds without it, size)
+    mended: dict[str, tuple[float, float]]  # cause -> (share mended by undoing it, its size)
 
 
 @dataclass

@@ -123,7 +123,7 @@ def _accept_undecided(row: Comparison) -> Comparison:
 
 
 _WINDOW = 10  # steps of a stretch
-_USUAL, _BROKEN = 0.98, 2.0  # a stretch with 2 x this quantile of the others' errors breaks
+_USUAL, _BROKEN = 0.98, 2.0  # a stretch breaks at 2 x the others' 0.98 quantile of errors
 _MAX_BROKEN = 0.05  # largest share of broken stretches, after subtracting the others' share
 _MAX_SPIKES = 0.25  # errors are spikes if a smaller share of the broken stretches' rows has them
 _MIN_WEIGHT = 0.1  # lags with a smaller share of the kernel's largest weight are ignored

@@ -31,7 +31,7 @@ from restock.train.twin.recording.robot_topics import Drive, Lidar, Odometer
 
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
-LIDAR_LSB_M = 2.0**-9  # about 2 mm
+LIDAR_LSB_M = 2.0**-9  # resolution of ranges, about 2 mm
 PLANNING_S = (0.005, 0.007)  # delay from a tick to the navigation stack's proposal
 THINKING_S = (0.012, 0.016)  # delay from a tick to its command; longer than any other topic's
 BUMPER_POLL_S = 0.02
@@ -70,7 +70,7 @@ DELAYS = {
     "/cmd_vel": Delay(0.2),
 }
 MAX_NETWORK_MS = 3.0
-TRAFFIC_HZ = 2.0  # while anyone moves
+TRAFFIC_HZ = 2.0  # rate of traffic messages while anyone moves
 
 
 Hertz = Annotated[float, Meta(gt=0, le=200)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 STEPS_A_SECOND = 500  # steps of the twin on a free core, to plan the draws of a run
 WARM_UP_PART = 0.5  # if rows are few: share of the allowed draws for offline updates
-UPDATES_A_MINUTE = 400  # on logs alone; 2,000 take five minutes with all other stages
+UPDATES_A_MINUTE = 400  # for logs alone: 2,000 updates take five minutes with all other stages
 INTERVALS = 20  # a run without a twin records metrics at least this often
 DRIVERS = "behaviour_policies"  # key of a coverage row: who drove
 INSIDE = 0.5  # an outline with lidar returns inside it at more than this share of ticks is wrong
