@@ -19,13 +19,11 @@ from restock.report import gap_page, write_page
 from restock.stats import NOT_KNOWN, ConfidenceInterval
 from restock.train.twin.calibration.gap import (
     AFTER,
-    AGREES,
     BEFORE,
-    ROUTE,
-    agreement,
+    _ahead_m,
+    _look_at_route,
     measure_gap,
     one_step,
-    rebuild_plans,
 )
 from restock.train.twin.calibration.logged_steps import (
     logged_steps,
@@ -33,7 +31,6 @@ from restock.train.twin.calibration.logged_steps import (
     previous_action,
     sector_clearance,
 )
-from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.calibration.twin_gap import (
     TRUSTED,
     UNDECIDED,
@@ -46,7 +43,6 @@ from restock.train.twin.calibration.twin_gap import (
     trust_verdict,
     write_gap,
 )
-from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
@@ -104,9 +100,7 @@ def test_slippery_floor_is_untrusted(gap: TwinGap) -> None:
         "metres" in verdicts["wheel_slip"].reasons[0] or " m " in verdicts["wheel_slip"].reasons[0]
     )
     assert verdicts["nominal"].verdict == TRUSTED
-    # Beside racks the twin has contacts that the log lacks, with large penalties.
-    assert gap.untrusted == ["recovery", "wheel_slip"]
-    assert "reward" in verdicts["recovery"].reasons[0]
+    assert gap.untrusted == ["wheel_slip"]
     assert any("patches" in line for line in gap.not_done)
 
 
@@ -130,14 +124,27 @@ def test_true_parameters_reduce_one_step_gaps(gap: TwinGap) -> None:
     assert whole[AFTER] < whole[BEFORE]
 
 
-def test_lidar_is_compared_on_matching_floor(gap: TwinGap, stored: Path) -> None:
-    sectors = [row for row in gap.observations if row["component"].startswith("clearance_")]
-    assert sectors
-    with Store(stored) as store:
-        steps = logged_steps(store)
-        rows = np.flatnonzero(steps.conditions["nominal"])[::20]
-        assert agreement(steps, store, rows, default_warehouse()) < AGREES / 2
-        assert agreement(steps, store, rows, empty_floor()) > 2 * AGREES
+def test_route_is_seen_from_the_twins_pose() -> None:
+    """Place the twin 4 cm ahead of the log, 3 cm to the left and turned, on a plan to the north."""
+    logged = {
+        "pose_x_m": np.array([5.0]), "pose_y_m": np.array([2.0]),
+        "pose_yaw_rad": np.array([np.pi / 2]),
+        "waypoint_near_x_m": np.array([1.0]), "waypoint_near_y_m": np.array([0.0]),
+        "waypoint_far_x_m": np.array([2.0]), "waypoint_far_y_m": np.array([0.0]),
+        "route_remaining_m": np.array([6.0]), "goal_distance_m": np.array([0.03]),
+    }  # fmt: skip
+    twin = logged | {
+        "pose_x_m": np.array([4.97]), "pose_y_m": np.array([2.04]),
+        "pose_yaw_rad": np.array([np.pi / 2 + 0.1]),
+    }  # fmt: skip
+    assert _ahead_m(logged, logged, twin) == pytest.approx(0.04)
+    _look_at_route(logged, twin)
+    for point, away_m in (("near", 0.96), ("far", 1.96)):
+        x, y = (float(twin[f"waypoint_{point}_{axis}_m"][0]) for axis in "xy")
+        assert np.hypot(x, y) == pytest.approx(np.hypot(away_m, 0.03))
+        assert np.arctan2(y, x) == pytest.approx(np.arctan2(-0.03, away_m) - 0.1)
+    assert twin["route_remaining_m"] == pytest.approx(5.96)
+    assert twin["goal_distance_m"] == 0.0  # it does not overshoot
 
 
 def test_rebuilt_steps_match_the_log(stored: Path) -> None:
@@ -156,31 +163,13 @@ def test_rebuilt_steps_match_the_log(stored: Path) -> None:
     np.testing.assert_array_equal(
         previous_action(steps.task, seen)[1:][goes_on], steps.action[:-1][goes_on]
     )
-    plans = rebuild_plans(steps)
-    assert plans.error_m < 0.01
-    rows = np.arange(len(steps))
-    seen = plans._view(plans.routing.plan, steps.now)
-    for name in ROUTE:
-        assert np.median(np.abs(seen[name] - steps.now[name])) < 0.02, name
-    # With the logged poses, the rebuilt plans reproduce the logged route signals.
-    route = plans.seen_after(steps, rows, steps.after)
-    np.testing.assert_allclose(route["waypoint_near_x_m"], steps.after["waypoint_near_x_m"])
-    np.testing.assert_allclose(plans.progress_m(steps, rows, steps.after), steps.progress_m)
 
 
 def test_logged_reward_is_sum_of_terms(stored: Path) -> None:
     with Store(stored) as store:
         steps = logged_steps(store)
         rows = np.arange(0, len(steps), 5)
-        found = one_step(
-            store,
-            steps,
-            rebuild_plans(steps),
-            rows,
-            {AFTER: TRUE},
-            default_warehouse(),
-            GapConfig(),
-        )
+        found = one_step(store, steps, rows, {AFTER: TRUE}, GapConfig())
     assert found.unexplained == 0
     assert found.valid.all()
     np.testing.assert_allclose(sum(found.logged.terms.values()), found.logged.reward, atol=1e-3)
@@ -193,7 +182,7 @@ def test_gap_round_trips_and_renders(gap: TwinGap, tmp_path: Path) -> None:
     assert again.about == json.loads(json.dumps(gap.about))
     assert again.paths == gap.paths
     page = write_page(gap_page(again), tmp_path / "gap" / "index.html").read_text()
-    assert "Do not trust the twin in: recovery, wheel slip" in page
+    assert "Do not trust the twin in: wheel slip" in page
     assert charts_of(page)["charts"]
     write_gap(gap, tmp_path / "gap")  # a gap measured before is replaced
     (tmp_path / "other").mkdir()
@@ -229,7 +218,12 @@ def test_turtlebot3_gap_is_unknown(tmp_path: Path) -> None:
     assert {found.verdict for found in gap.verdicts} == {UNKNOWN}  # one episode of half a minute
     text = " ".join(gap.not_done)
     assert "{" not in text
-    for not_there in ("another floor", "no goal and no plan", "wheel odometry", "no fitted"):
+    for not_there in (
+        "Lidar readings were not",
+        "no goal and no plan",
+        "wheel odometry",
+        "no fitted",
+    ):
         assert not_there in text, not_there
     assert position(gap, "nominal", BEFORE, 1.0)["median"] < 0.02
     assert not [row for row in gap.observations if row["component"].startswith("clearance_")]

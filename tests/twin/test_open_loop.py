@@ -6,7 +6,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.long import one_in
 from support.paths import ROOT, SHARED
 
 from restock.ingest.pipeline import ingest
@@ -20,7 +19,6 @@ from restock.train.twin.calibration.open_loop import (
     drive_open_loop,
     log_segments,
 )
-from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 
 LATE = Perturbation(name="late", latency_s=0.15, wheel_radius_scale=0.96, gyro_bias_radps=0.01)
@@ -90,14 +88,10 @@ def test_fit_and_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None
     assert steps.followed[rows].all()
 
 
-@pytest.mark.parametrize("mapped", one_in(2, [True, False]))
-def test_single_step_equals_start_of_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
+def test_single_step_equals_start_of_longer_drive(steps: LoggedSteps) -> None:
     rows = log_segments(steps, 1.2).row[::3]
-    warehouse = default_warehouse() if mapped else None
     single, longer = (
-        drive_open_loop(
-            steps.task, start_of(steps, rows, count), [Perturbation(), LATE], warehouse=warehouse
-        )
+        drive_open_loop(steps.task, start_of(steps, rows, count), [Perturbation(), LATE])
         for count in (1, 4)
     )
     assert single.pose.shape == (2, len(rows), 2, 3)
@@ -105,4 +99,3 @@ def test_single_step_equals_start_of_longer_drive(steps: LoggedSteps, mapped: bo
     for name, values in single.signals.items():
         assert np.array_equal(values, longer.signals[name][..., :2]), name
     assert np.array_equal(single.sliding_mps, longer.sliding_mps[..., :2])
-    assert single.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)

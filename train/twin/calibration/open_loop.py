@@ -30,7 +30,6 @@ from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import RobotModel
-from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import Simulation
 
 WARMUP_S = 1.0  # longer than any latency, and than stopping with friction .2
@@ -301,8 +300,6 @@ class OpenLoopResult:
 
     signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
     sliding_mps: F64  # (P, S, K + 1) sliding speed along the robot, of the wheel that slides faster
-    bumped: Bools  # (P, S) the bumper was pressed in the last period
-    sector_clearance_m: F64  # (P, S, sectors) at the end; (P, S, 0) on an empty floor
     diverged: Bools  # (P, S) the physics diverged, so the other values are meaningless
 
     @property
@@ -317,15 +314,13 @@ def drive_open_loop(
     perturbations: Sequence[Perturbation],
     *,
     robot: RobotModel | None = None,
-    warehouse: Warehouse | None = None,
     timestep_s: float = 0.01,
     nthread: int = 1,
 ) -> OpenLoopResult:
-    """Drive every start's commands under every perturbation: P x S robots.
+    """Drive every start's commands under every perturbation, on an empty floor: P x S robots.
 
-    `robot` None means the twin's stand-in, `warehouse` None an empty floor. The perturbations'
-    `timestep_s` and sensor noise are not used. A drive's result depends neither on `nthread` nor on
-    the other starts and perturbations.
+    `robot` None means the twin's stand-in. The perturbations' `timestep_s` and sensor noise are not
+    used. A drive's result depends neither on `nthread` nor on the other starts and perturbations.
 
     Raises:
         ConfigError: the timestep does not divide .1 s, or the control period is not a whole number
@@ -333,21 +328,19 @@ def drive_open_loop(
     """
     shape = (len(perturbations), len(start.pose))
     jobs, periods = shape[0] * shape[1], start.command.shape[1]
-    sectors = 0 if warehouse is None else task.sectors
     pose = np.zeros((jobs, periods + 1, 3))
     signals = {name: np.zeros((jobs, periods + 1)) for name in SENSED}
     sliding = np.zeros((jobs, periods + 1))
-    bumped, diverged = np.zeros((2, jobs), np.bool_)
-    clearance = np.zeros((jobs, sectors))
+    diverged = np.zeros(jobs, np.bool_)
     simulation: Simulation | None = None
     for begin in range(0, jobs, ROBOTS):
         ids = np.arange(begin, min(begin + ROBOTS, jobs))
         if simulation is None or simulation.num_envs != len(ids):
-            floor = warehouse or empty_floor()
+            floor = empty_floor()
             simulation = Simulation(len(ids), task, floor, timestep_s, nthread, robot=robot)
         which, number = np.divmod(ids, shape[1])
         twins, part = [perturbations[index] for index in which], start.take(number)
-        offset = _place(simulation, part, twins, endless=warehouse is None)
+        offset = _place(simulation, part, twins)
         bias = np.array([twin.gyro_bias_radps for twin in twins])
         for step in range(periods + 1):
             if step:
@@ -360,17 +353,11 @@ def drive_open_loop(
             for name, values in zip(SENSED, sensed, strict=True):
                 signals[name][ids, step] = values
             sliding[ids, step] = _sliding(simulation, pose[ids, step, 2])
-            if warehouse is None:
-                offset += _recentre(simulation)
-        bumped[ids] = simulation.bumped
-        if sectors:
-            clearance[ids] = see_sectors(simulation)
+            offset += _recentre(simulation)
     signals |= {name: pose[..., i] for i, name in enumerate(POSE)}
     return OpenLoopResult(
         signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
         sliding_mps=sliding.reshape(*shape, -1),
-        bumped=bumped.reshape(shape),
-        sector_clearance_m=clearance.reshape(*shape, sectors),
         diverged=diverged.reshape(shape),
     )
 
@@ -381,33 +368,18 @@ def empty_floor() -> Warehouse:
     return Warehouse(EMPTY_M, EMPTY_M, racks=(), segments=(), goals_m=(middle,), name="empty")
 
 
-def see_sectors(simulation: Simulation) -> F64:
-    """Return the sector clearances (N, sectors) that robots sense now, without noise."""
-    sensing = Sensing(simulation, simulation.task)  # has no noise until an episode is drawn
-    ids = np.arange(simulation.num_envs)
-    return np.asarray(sensing.sense(ids, np.zeros(len(ids), np.int64))["sector_clearance_m"])
-
-
 def _place(
-    simulation: Simulation,
-    start: OpenLoopStart,
-    perturbations: Sequence[Perturbation],
-    *,
-    endless: bool,
+    simulation: Simulation, start: OpenLoopStart, perturbations: Sequence[Perturbation]
 ) -> F64:
-    """Give every robot its logged pose and motion; return map minus simulated position (N, 2).
+    """Give every robot its logged motion, in the middle of the floor with its logged heading.
 
-    On an `endless` floor robots start in its middle.
+    Returns map minus simulated position (N, 2).
     """
-    middle = np.full(2, EMPTY_M / 2)
-    offset = start.pose[:, :2] - middle if endless else np.zeros((len(start.pose), 2))
-    motion = start.motion
+    middle = (EMPTY_M / 2, EMPTY_M / 2)
+    offset, motion = start.pose[:, :2] - middle, start.motion
     for env, perturbation in enumerate(perturbations):
-        x, y = middle if endless else start.pose[env, :2]
-        plan = np.array([[x, y], [x, y]])
-        episode = Episode(
-            EpisodeSpec("nominal", 0), (x, y, start.pose[env, 2]), goal=(x, y), plan_m=plan
-        )
+        place = (*middle, float(start.pose[env, 2]))
+        episode = Episode(EpisodeSpec("nominal", 0), place, middle, np.array([middle, middle]))
         simulation.reset(env, episode, perturbation)
     wheels = np.asarray(motion["wheel_speed_mps"])
     localised = np.asarray(motion["localised_speed_mps"])
