@@ -39,8 +39,10 @@ from restock.train.twin.calibration.open_loop import (
     ordinary_driving,
     replay_segments,
     split_at,
+    warmup_steps,
 )
 from restock.train.twin.physics.perturbation import (
+    RANGES,
     Perturbation,
     find_perturbation,
     load_perturbation,
@@ -145,6 +147,13 @@ def fit_store(store: Path, names: tuple[str, ...], **options: object) -> FittedT
         return fit(opened, FitConfig(parameters=names, **options))  # type: ignore[arg-type]
 
 
+def test_search_and_warm_up_cover_every_latency_of_a_fast_controller() -> None:
+    most = RANGES["latency_s"][1]
+    assert Coordinates(("latency_s",)).values(np.ones(1)) == pytest.approx(most)
+    task = msgspec.structs.replace(load_profile("warehouse_amr").task, control_period_s=0.05)
+    assert warmup_steps(task) * task.control_period_s >= most
+
+
 @pytest.mark.long
 def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path) -> None:
     found = fit_store(
@@ -181,7 +190,7 @@ def test_friction_under_standing_wheels_is_not_identified(log: LoggedSegments) -
         signals={name: np.zeros_like(values) for name, values in some.signals.items()},
     )
     residuals = ReplayResiduals(standing)
-    coordinates = Coordinates(("friction_scale",), log.task)
+    coordinates = Coordinates(("friction_scale",))
     solution = _least_squares(residuals, coordinates, np.array([0.5]), lambda text: None)
     uncertainty = measure_uncertainty(solution, standing.episode_id, seed=0)
     lost = unidentified(residuals, solution, uncertainty)

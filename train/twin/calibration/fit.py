@@ -130,7 +130,7 @@ def fit(
         ReplayResiduals(segments, scope.channels, nthread=config.nthread)
         for segments in (few, data.segments)
     )
-    coordinates = Coordinates(scope.names, task)
+    coordinates = Coordinates(scope.names)
     start = _search(coarse, coordinates, config, report)
     solution, uncertainty, dropped = _identify(fine, coordinates, start, config, store, report)
     refused = [as_in_base(name, reason) for name, reason in scope.refused.items()]

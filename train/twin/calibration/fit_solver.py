@@ -88,13 +88,10 @@ class Coordinates:
     Parameters that are not fitted have the values of `BASE`.
     """
 
-    def __init__(self, names: Sequence[str], task: Task) -> None:
-        self.names, self.task = tuple(names), task
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
         self.parameters = [PARAMETERS[name] for name in names]
         ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
-        if "latency_s" in self.names:  # at most four control periods are searched
-            most = min(RANGES["latency_s"][1], 4 * task.control_period_s)
-            ends[self.names.index("latency_s"), 1] = most
         self._ratio = np.array([item.ratio for item in self.parameters], np.bool_)
         ends[self._ratio] = np.log(ends[self._ratio])
         self._low, self._span = ends[:, 0], ends[:, 1] - ends[:, 0]
@@ -140,7 +137,7 @@ class Coordinates:
 
     def without(self, name: str) -> Coordinates:
         """Return these coordinates without one parameter, which then has the value of `BASE`."""
-        return Coordinates([other for other in self.names if other != name], self.task)
+        return Coordinates([other for other in self.names if other != name])
 
 
 @dataclass(frozen=True)
@@ -493,7 +490,7 @@ class _GoodEnough(Exception):
     """Raised to stop the solver once a step reduces the cost by less than `ENOUGH`."""
 
 
-def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
+def channel_noise(residuals: Mapping[str, F64]) -> dict[str, float]:
     """Return each channel's noise, from residuals (1, S, R) at a solution.
 
     It is the median deviation, scaled up for the correlation c of neighbouring steps: n residuals
@@ -501,10 +498,9 @@ def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict
     """
     scale = {}
     for name, residual in residuals.items():
-        rows = residual[0]
-        runs = (
-            np.concatenate(np.split(rows, position_parts, axis=1)) if name == "position" else rows
-        )
+        runs = residual[0]
+        if name == "position":  # x and y
+            runs = np.concatenate(np.split(runs, 2, axis=1))
         spread = max(1.4826 * float(np.median(np.abs(runs))), LEAST[name])
         clipped = np.clip(runs, -4 * spread, 4 * spread)
         square = float((clipped**2).mean())

@@ -55,6 +55,7 @@ from restock.train.twin.calibration.open_loop import (
     OpenLoopStart,
     drive_open_loop,
     empty_floor,
+    warmup_steps,
 )
 from restock.train.twin.calibration.path_gap import (
     QUANTITIES,
@@ -70,8 +71,6 @@ from restock.train.twin.calibration.twin_gap import (
     trust_verdict,
 )
 from restock.train.twin.physics.perturbation import Perturbation
-
-PAST = 5  # commands before the step that are replayed: longer than any latency and ramp
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,8 @@ def one_step(
     logged = StepResult(next_observed, earned, logged_terms)
     adds_up = np.abs(summed - earned) < 1e-3
     pose = np.stack([now[name] for name in POSE], axis=-1)
-    start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
+    past = steps.commands(rows, warmup_steps(task), 0)
+    start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past)
     driven = drive_open_loop(
         task, start, list(twins.values()), robot=steps.robot,
         timestep_s=config.timestep_s, nthread=config.nthread,

@@ -99,7 +99,6 @@ def log_segments(
     horizon_s: float,
     *,
     stride_s: float | None = None,
-    warmup_s: float = WARMUP_S,
 ) -> LoggedSegments:
     """Cut logged episodes into segments of `horizon_s`.
 
@@ -115,7 +114,7 @@ def log_segments(
     task, rows = steps.task, steps.now
     horizon = _periods(task, horizon_s, "horizon_s")
     stride = horizon if stride_s is None else _periods(task, stride_s, "stride_s")
-    warmup = int(np.ceil(warmup_s / task.control_period_s - 1e-9))
+    warmup = warmup_steps(task)
     period_ns = round(task.control_period_s * 1e9)
     fresh = _find_fresh(steps, period_ns)
 
@@ -254,6 +253,11 @@ def whole_periods_s(task: Task, seconds: float) -> float:
     period_s = task.control_period_s
     whole = round(max(round(seconds / period_s), 1) * period_s, 6)
     return whole if abs(whole - seconds) <= 0.05 * seconds else seconds
+
+
+def warmup_steps(task: Task) -> int:
+    """Return the number of control periods in `WARMUP_S`, rounded up."""
+    return int(np.ceil(WARMUP_S / task.control_period_s - 1e-9))
 
 
 def _periods(task: Task, seconds: float, name: str) -> int:
