@@ -154,6 +154,8 @@ def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     assert {spec.condition for spec in first} == {"wheel_slip"}
     twin.queue.drawn[:] = 1
     assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same on every call
+    with pytest.raises(ValueError, match="shorter"):
+        twin.set_mission_shares([0, 1])
 
 
 def test_mission_order_is_a_named_arm() -> None:

@@ -13,7 +13,7 @@ from restock.train.dqn.config import parse_config
 from restock.train.feed.practice import make_twin
 from restock.train.judge.comparability import kind_of
 from restock.train.prepare import prepare_new
-from restock.train.twin.env.episode_queue import EpisodeQueue, MissionOrders
+from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArms, MissionOrders
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.floors.planner import planners
@@ -150,9 +150,10 @@ def draw_specs(
     missions: tuple[MissionOrder, ...], share: float, count: int = 400
 ) -> list[EpisodeSpec]:
     """Return the episodes that one of two environments starts."""
-    queue = EpisodeQueue(2, [FLOOR], {"nominal": 1.0}, None, seed=5)
-    if missions:
-        queue.follow(orders(*missions), share)
+    ordered = orders(*missions) if missions else None
+    conditions = {"nominal": 1.0}
+    arms = MissionArms([FLOOR], PLANNERS, conditions, orders=ordered, orders_share=share)
+    queue = EpisodeQueue(2, arms, seed=5)
     return [queue.next(1)[0] for _ in range(count)]
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import msgspec
@@ -29,14 +30,6 @@ from restock.train.twin.physics.perturbation import Schedule
 
 TRIES = 300  # seeds that are tried for a route through a zone
 WAY_POINTS = 24  # number of points on each leg of a plan whose zones are looked up
-
-
-@dataclass(frozen=True)
-class _Floor:
-    """A floor that an order can be driven on, and the order's zone on it."""
-
-    place: int  # index among the floors
-    zone: str | None
 
 
 class MissionOrders:
@@ -73,12 +66,12 @@ class MissionOrders:
         kind = str(order.kind)
         rng = np.random.default_rng([seed, number])
         for _ in range(TRIES):
-            floor = on[int(rng.integers(len(on)))]
+            place, zone = on[int(rng.integers(len(on)))]
             drawn = int(rng.integers(1 << 31))
             # A single floor is not named, so that specs are the same as in earlier versions.
-            named = self._floors[floor.place].name if len(self._floors) > 1 else None
+            named = self._floors[place].name if len(self._floors) > 1 else None
             spec = EpisodeSpec(kind, drawn, layout=named)
-            if floor.zone is None or self._comes_through(spec, floor):
+            if zone is None or self._comes_through(spec, place, zone):
                 return spec
         raise ConfigError(
             f"none of {TRIES} routes of a {kind} mission passes through {order.zone}",
@@ -86,59 +79,54 @@ class MissionOrders:
             remedy="leave out `zone`, or choose one on a robot's route",
         )
 
-    def _comes_through(self, spec: EpisodeSpec, floor: _Floor) -> bool:
-        warehouse = self._floors[floor.place]
-        plan = draw_episode(spec, warehouse, self._planners[floor.place]).plan_m  # (P, 2)
+    def _comes_through(self, spec: EpisodeSpec, place: int, zone: str) -> bool:
+        plan = draw_episode(spec, self._floors[place], self._planners[place]).plan_m  # (P, 2)
         along = np.linspace(0.0, 1.0, WAY_POINTS)[:, None, None]
         points = (plan[:-1] + along * (plan[1:] - plan[:-1])).reshape(-1, 2)
-        return floor.zone in warehouse.zone_of(points[:, 0], points[:, 1])
+        return zone in self._floors[place].zone_of(points[:, 0], points[:, 1])
 
-    def _find_floors(self, number: int, order: MissionOrder) -> list[_Floor]:
-        where = f"{self._where}, missions[{number}]"
+    def _find_floors(self, number: int, order: MissionOrder) -> list[tuple[int, str | None]]:
+        """Return the indices of floors that an order can be driven on, each with its zone."""
+
+        def refuse(problem: str, remedy: str) -> ConfigError:
+            return ConfigError(problem, where=f"{self._where}, missions[{number}]", remedy=remedy)
+
         if order.kind is None or order.missions is None:
-            raise ConfigError(
+            raise refuse(
                 "asks for hours of logging, but the twin drives a number of missions",
-                where=where,
-                remedy=f"give `kind` ({', '.join(KINDS)}) and `missions`",
+                f"give `kind` ({', '.join(KINDS)}) and `missions`",
             )
         if order.kind not in KINDS:
-            raise ConfigError(
-                f"the twin has no missions of kind {order.kind!r}",
-                where=where,
-                remedy=f"it has {', '.join(KINDS)}",
-            )
-        names = [floor.name for floor in self._floors]
-        if order.layout is not None and order.layout not in names:
-            raise ConfigError(
-                f"the floor {order.layout!r} is not among the floors of this run",
-                where=where,
-                remedy=f"they are {_list_some(names)}: choose one of these, or add that floor "
-                "(`layouts`)",
+            raise refuse(
+                f"the twin has no missions of kind {order.kind!r}", f"it has {', '.join(KINDS)}"
             )
         chosen = [
             (place, floor)
             for place, floor in enumerate(self._floors)
             if order.layout in (None, floor.name)
         ]
+        if not chosen:
+            raise refuse(
+                f"the floor {order.layout!r} is not among the floors of this run",
+                f"they are {_list_some([floor.name for floor in self._floors])}: choose one of"
+                " these, or add that floor (`layouts`)",
+            )
+        fitting = [(place, _find_zone(floor, order.zone)) for place, floor in chosen]
         if order.zone is not None:
-            fitting = [_Floor(place, _find_zone(floor, order.zone)) for place, floor in chosen]
-            fitting = [entry for entry in fitting if entry.zone is not None]
-            if not fitting:
-                zones = dict.fromkeys(zone for _, floor in chosen for zone in floor.zones)
-                raise ConfigError(
-                    f"no floor of this run has a zone {order.zone!r}",
-                    where=where,
-                    remedy=f"the zones are {_list_some(list(zones))}",
-                )
-        else:
-            fitting = [_Floor(place, None) for place, _ in chosen]
-        refuse_unfit([self._floors[entry.place] for entry in fitting], [order.kind])
+            fitting = [(place, zone) for place, zone in fitting if zone is not None]
+        if not fitting:
+            zones = dict.fromkeys(zone for _, floor in chosen for zone in floor.zones)
+            raise refuse(
+                f"no floor of this run has a zone {order.zone!r}",
+                f"the zones are {_list_some(list(zones))}",
+            )
+        refuse_unfit([self._floors[place] for place, _ in fitting], [order.kind])
         return fitting
 
 
-def _find_zone(floor: Warehouse, zone: str) -> str | None:
+def _find_zone(floor: Warehouse, zone: str | None) -> str | None:
     """Return a zone's name on a floor, also if given as `FLOOR/ZONE`; None without such a zone."""
-    name = zone.removeprefix(f"{floor.name}/")
+    name = (zone or "").removeprefix(f"{floor.name}/")
     return name if name in floor.zones else None
 
 
@@ -166,7 +154,15 @@ class MissionArm:
 
 
 class MissionArms:
-    """The arms of a twin: its kinds of episodes, each block of them, and its orders."""
+    """The missions that a twin can draw: kinds of episodes by their shares, and ordered missions.
+
+    `conditions` are shares per kind; a schedule draws a perturbation for each mission. If missions
+    are ordered, they are `orders_share` of all missions. `arms` are groups of missions that
+    practice can choose among: the kinds, each block of them, and the orders.
+
+    Raises:
+        ConfigError: an unknown condition, or shares that are not numbers of at least 0.
+    """
 
     def __init__(
         self,
@@ -178,29 +174,64 @@ class MissionArms:
         orders: MissionOrders | None = None,
         orders_share: float = 0.0,
     ) -> None:
+        shares = conditions.values()
+        if (
+            set(conditions) - set(KINDS)
+            or not all(share >= 0 for share in shares)
+            or not 0 < sum(shares) < np.inf
+        ):
+            raise ConfigError(
+                f"conditions {conditions!r} are not shares per kind of episode",
+                where="the twin",
+                remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
+            )
+        self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
+        self.schedule, self.orders, self.orders_share = schedule, orders, orders_share
         self._floors, self._planners = list(floors), list(planners)
         self._place = {floor.name: place for place, floor in enumerate(floors)}
-        self._schedule, self._orders = schedule, orders
-        left = 1.0 if orders is None else 1.0 - orders_share
-        total = sum(conditions.values())
+
+    @cached_property
+    def arms(self) -> list[MissionArm]:
+        """Return the arms, each with its share if practice is off."""
+        left = 1.0 if self.orders is None else 1.0 - self.orders_share
+        total = sum(self.conditions.values())
         arms = [
             arm
-            for kind, part in conditions.items()
+            for kind, part in self.conditions.items()
             if left * part  # a kind whose share is 0 is evaluated, but never practised
             for arm in self._split_by_block(MissionArm(kind, kind, left * part / total))
         ]
-        if orders is not None:
+        if self.orders is not None:
             arms += [
                 MissionArm(
                     f"missions[{number}] {order.kind}"
                     + "".join(f" {part}" for part in (order.zone, order.layout) if part),
                     str(order.kind),
-                    orders_share * float(orders.shares[number]),
+                    self.orders_share * float(self.orders.shares[number]),
                     order=number,
                 )
-                for number, order in enumerate(orders.orders)
+                for number, order in enumerate(self.orders.orders)
             ]
-        self.arms: list[MissionArm] = arms
+        return arms
+
+    def floor_of(self, spec: EpisodeSpec) -> int:
+        """Return the index of an episode's floor: by its name, or drawn by its seed.
+
+        Raises:
+            ConfigError: there is no floor of that name.
+        """
+        if spec.layout is None:
+            if len(self._place) == 1:
+                return 0
+            return int(np.random.default_rng([spec.seed, 2]).integers(len(self._place)))
+        if spec.layout not in self._place:
+            raise ConfigError(
+                f"an episode needs layout {spec.layout!r}, which is not among the environment's"
+                f" {len(self._place)}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that layout",
+            )
+        return self._place[spec.layout]
 
     def spec(self, number: int, seed: int) -> EpisodeSpec:
         """Return a mission of an arm, with its perturbation: the same for the same seed.
@@ -209,13 +240,13 @@ class MissionArms:
             ConfigError: none of `BLOCK_TRIES` seeds gave the arm's block.
         """
         arm = self.arms[number]
-        if arm.order >= 0 and self._orders is not None:
-            return perturbed(self._orders.spec(arm.order, seed), self._schedule)
+        if arm.order >= 0 and self.orders is not None:
+            return self.perturbed(self.orders.spec(arm.order, seed))
         rng = np.random.default_rng([seed, 3])
         for _ in range(BLOCK_TRIES):
             spec = EpisodeSpec(arm.kind, seed)
             if not arm.block or self._block(spec) == arm.block:
-                return perturbed(spec, self._schedule)
+                return self.perturbed(spec)
             seed = int(rng.integers(1 << 31))
         raise ConfigError(
             f"none of {BLOCK_TRIES} seeds gave a mission of {arm.name}",
@@ -223,8 +254,15 @@ class MissionArms:
             remedy="its floor hardly has room for it: give the kind no share",
         )
 
+    def perturbed(self, spec: EpisodeSpec) -> EpisodeSpec:
+        """Return an episode with a perturbation drawn by its seed, if there is a schedule."""
+        if self.schedule is None:
+            return spec
+        rng = np.random.default_rng([spec.seed, 1])
+        return msgspec.structs.replace(spec, perturbation=self.schedule.draw(rng))
+
     def _block(self, spec: EpisodeSpec) -> str:
-        place = floor_place(spec, self._place)
+        place = self.floor_of(spec)
         return draw_episode(spec, self._floors[place], self._planners[place]).block
 
     def _split_by_block(self, arm: MissionArm) -> list[MissionArm]:
@@ -250,109 +288,24 @@ class MissionArms:
         return [block for block in blocks if block in found] or [""]
 
 
-def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
-    """Return an episode with a perturbation drawn by its seed; unchanged without a schedule."""
-    if schedule is None:
-        return spec
-    rng = np.random.default_rng([spec.seed, 1])
-    return msgspec.structs.replace(spec, perturbation=schedule.draw(rng))
-
-
-def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
-    """Return the index of an episode's floor: by its name, or drawn by its seed.
-
-    Raises:
-        ConfigError: there is no floor of that name.
-    """
-    if spec.layout is None:
-        if len(places) == 1:
-            return 0
-        return int(np.random.default_rng([spec.seed, 2]).integers(len(places)))
-    if spec.layout not in places:
-        raise ConfigError(
-            f"an episode needs layout {spec.layout!r}, which is not among the environment's"
-            f" {len(places)}",
-            where=f"episode {spec.condition}/{spec.seed}",
-            remedy="make the environment with that layout",
-        )
-    return places[spec.layout]
-
-
 class EpisodeQueue(Stateful):
-    """A queue of episodes. An environment's n-th drawn episode is independent of all others.
-
-    `conditions` are shares per kind of episode; a schedule draws a perturbation for each drawn
-    episode. If missions are ordered (`follow`), a share of the drawn episodes comes from them.
-
-    Raises:
-        ConfigError: an unknown condition, or shares that are not numbers of at least 0.
-    """
+    """A queue of episodes. An environment's n-th drawn episode is independent of all others."""
 
     STATE = ("seed", "conditions", "drawn", "fixed", "next_fixed")
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"fixed": list[EpisodeSpec]}
 
-    def __init__(
-        self,
-        num_envs: int,
-        floors: Sequence[Warehouse],
-        conditions: Mapping[str, float],
-        schedule: Schedule | None,
-        seed: int,
-    ) -> None:
-        self.seed, self.schedule = seed, schedule
-        self._layouts = list(floors)
-        self._floors = {floor.name: index for index, floor in enumerate(floors)}
+    def __init__(self, num_envs: int, missions: MissionArms, seed: int) -> None:
+        self.seed, self.missions = seed, missions
+        self.conditions = missions.conditions
         self.drawn = np.zeros(num_envs, np.int64)  # episodes so far, per environment
         self.fixed: list[EpisodeSpec] = []
         self.next_fixed = 0
-        self._orders: MissionOrders | None = None
-        self._orders_share = 0.0
-        self._offered: MissionArms | None = None  # what `arms` returned last
-        self._arms: MissionArms | None = None  # arms to draw episodes from; None: no practice
-        self._arm_shares = np.zeros(0)  # cumulative shares of `_arms`
-        self.set_conditions(conditions)
-
-    def set_conditions(self, conditions: Mapping[str, float]) -> None:
-        """Set the shares per kind of episode, for episodes that begin from now on."""
-        shares = conditions.values()
-        if (
-            set(conditions) - set(KINDS)
-            or not all(share >= 0 for share in shares)
-            or not 0 < sum(shares) < np.inf
-        ):
-            raise ConfigError(
-                f"conditions {conditions!r} are not shares per kind of episode",
-                where="the twin",
-                remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
-            )
-        self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
-        parts = np.array([self.conditions.get(kind, 0.0) for kind in KINDS])
-        self._cumulative = np.cumsum(parts) / sum(shares)
-
-    def follow(self, orders: MissionOrders, share: float) -> None:
-        """Draw this share of the episodes from these orders from now on, by the orders' shares."""
-        self._orders, self._orders_share = orders, share
+        self._arm_shares: F64 | None = None  # cumulative; None: practice does not choose
 
     def practise(self, shares: Sequence[float]) -> None:
-        """Draw episodes from now on in these shares, one per arm that `arms` last returned."""
-        parts = np.asarray(shares, np.float64)
-        self._arms, self._arm_shares = self._offered, np.cumsum(parts) / parts.sum()
-
-    def arms(self, planners: Sequence[Planner]) -> list[MissionArm]:
-        """Return the arms that episodes can be drawn from; `practise` sets their shares."""
-        self._offered = MissionArms(
-            self._layouts,
-            planners,
-            self.conditions,
-            schedule=self.schedule,
-            orders=self._orders,
-            orders_share=self._orders_share,
-        )
-        return self._offered.arms
-
-    def restored(self) -> None:
-        """Recompute the cumulative shares after a state was restored."""
-        self.set_conditions(self.conditions)
+        """Draw episodes from now on in these shares, one per arm of the missions."""
+        parts = np.array([share for _, share in zip(self.missions.arms, shares, strict=True)])
+        self._arm_shares = np.cumsum(parts) / parts.sum()
 
     def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
         """Run these episodes next, in order, in any environment."""
@@ -369,18 +322,17 @@ class EpisodeQueue(Stateful):
         draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(5)
         self.drawn[env] += 1
         seed = int(draw[1]) << 20 ^ int(draw[2])
-        if self._arms is not None:
+        missions, orders = self.missions, self.missions.orders
+        if self._arm_shares is not None:
             arm = _draw_index(self._arm_shares, draw[0])
-            return self._arms.spec(arm, seed), -1, arm
-        if self._orders is not None and draw[3] / 2**32 < self._orders_share:
-            spec = self._orders.spec(_draw_index(np.cumsum(self._orders.shares), draw[4]), seed)
+            return missions.spec(arm, seed), -1, arm
+        if orders is not None and draw[3] / 2**32 < missions.orders_share:
+            spec = orders.spec(_draw_index(np.cumsum(orders.shares), draw[4]), seed)
         else:
-            spec = EpisodeSpec(KINDS[_draw_index(self._cumulative, draw[0])], seed)
-        return perturbed(spec, self.schedule), -1, -1
-
-    def floor_of(self, spec: EpisodeSpec) -> int:
-        """Return the index of an episode's floor. Raises ConfigError for an unknown name."""
-        return floor_place(spec, self._floors)
+            parts = np.array([self.conditions.get(kind, 0.0) for kind in KINDS])
+            kind = KINDS[_draw_index(np.cumsum(parts) / sum(parts), draw[0])]
+            spec = EpisodeSpec(kind, seed)
+        return missions.perturbed(spec), -1, -1
 
 
 def _draw_index(cumulative: F64, draw: np.integer[Any]) -> int:

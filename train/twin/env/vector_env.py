@@ -40,7 +40,12 @@ from restock.ingest.task.task import terminated as is_terminated
 from restock.ingest.task.task_sql import Past, Table
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful, saved
-from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
+from restock.train.twin.env.episode_queue import (
+    EpisodeQueue,
+    MissionArm,
+    MissionArms,
+    MissionOrders,
+)
 from restock.train.twin.env.interface import Info, PickledByArguments, Step
 from restock.train.twin.env.navigation import Navigation, Truth, info_after, info_now
 from restock.train.twin.env.render import draw_map
@@ -218,10 +223,18 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise ConfigError("autoreset must be SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
-        self.queue = EpisodeQueue(
-            num_envs, self.floors, conditions or DEFAULT_CONDITIONS, schedule, seed
+        self.navigation = Navigation(self.floors, num_envs, self.task, proposes=nav_command)
+        planners, orders = self.navigation.planners, None
+        if missions:
+            orders = MissionOrders(missions, self.floors, planners, where="env.missions")
+        arms = MissionArms(
+            *(self.floors, planners, conditions or DEFAULT_CONDITIONS),
+            schedule=schedule,
+            orders=orders,
+            orders_share=missions_share,
         )
-        refuse_unfit(self.floors, [kind for kind, share in self.queue.conditions.items() if share])
+        refuse_unfit(self.floors, [kind for kind, share in arms.conditions.items() if share])
+        self.queue = EpisodeQueue(num_envs, arms, seed)
 
         if robot is not None:
             refuse_too_large(self.floors, self.task.body)
@@ -240,11 +253,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
         )
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
-        self.navigation = Navigation(self.floors, num_envs, self.task, proposes=nav_command)
-        if missions:
-            planners = self.navigation.planners
-            orders = MissionOrders(missions, self.floors, planners, where="env.missions")
-            self.queue.follow(orders, missions_share)
         own: tuple[Table, ...] = ("reward_terms", OBSERVED)
         self.past = {t: Past(self.task, t, num_envs) for t in own if getattr(self.task, t)}
         self.limits: Limits | None = None  # a limiter that every command passes
@@ -274,10 +282,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
 
     def mission_arms(self) -> list[MissionArm]:
         """Return the arms that practice can choose among, each with its natural share."""
-        return self.queue.arms(self.navigation.planners)
+        return self.queue.missions.arms
 
     def set_mission_shares(self, shares: Sequence[float]) -> None:
-        """Set one share per arm of the last `mission_arms`, for episodes that begin from now on."""
+        """Set one share per arm of `mission_arms`, for episodes that begin from now on."""
         self.queue.practise(shares)
 
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
@@ -320,7 +328,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, P
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that perturbation",
             )
-        floor = self.queue.floor_of(spec)
+        floor = self.queue.missions.floor_of(spec)
         episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
         episode = with_room(episode, self.floors[floor], self.simulation.outline_m)
         self.specs[env] = spec
