@@ -1,6 +1,7 @@
 """Compare packed messages with the bytes that rosbags writes, and check the sinks."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.train.twin.recording.bag_writer import (
+    Exemplar,
     Format,
     Message,
-    MessageLayout,
     Topic,
     build,
     recording_sink,
@@ -31,31 +32,29 @@ STAMP_NS = 1_760_000_000_123_456_789
 def test_packed_messages_match_rosbags(frame, names, ranges):
     """Check alignment after strings and sequences of any length."""
     numbers = np.arange(len(names), dtype=float)
-    for shape, columns in [
+    header, transforms = {"frame_id": frame}, [{"child_frame_id": name} for name in names]
+    shapes: list[tuple[str, dict[str, Any], dict[str, np.ndarray]]] = [
         (
-            build("sensor_msgs/msg/LaserScan", header={"frame_id": frame}, ranges=ranges),
+            "sensor_msgs/msg/LaserScan",
+            {"header": header, "ranges": ranges},
             {"ranges": np.array([ranges], np.float32)} if ranges else {},
         ),
         (
-            build(
-                "sensor_msgs/msg/JointState",
-                header={"frame_id": frame},
-                name=names,
-                velocity=numbers,
-            ),
+            "sensor_msgs/msg/JointState",
+            {"header": header, "name": names, "velocity": numbers},
             {"velocity": numbers[None]} if names else {},
         ),
         (
-            build(
-                "tf2_msgs/msg/TFMessage", transforms=[{"child_frame_id": name} for name in names]
-            ),
+            "tf2_msgs/msg/TFMessage",
+            {"transforms": transforms},
             {f"transforms[{i}].transform.rotation.w": np.ones(1) for i in range(len(names))},
         ),
-    ]:
-        layout = MessageLayout.of(shape)
-        assert layout.pack(columns, rows=1) == [serialise(shape)]
-        again = typestore().deserialize_cdr(layout.exemplar, layout.type_name)
-        assert serialise(again) == layout.exemplar
+    ]
+    for name, fields, columns in shapes:
+        exemplar, data = Exemplar(name, **fields), serialise(build(name, **fields))
+        assert exemplar.layout[0] == data
+        assert not columns or exemplar.pack(columns) == [data]
+        assert serialise(typestore().deserialize_cdr(data, name)) == data
 
 
 def test_plan_fills_every_pose_of_the_path() -> None:

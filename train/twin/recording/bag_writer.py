@@ -5,9 +5,9 @@ the end, or removed if anything (Ctrl-C included) stops the writing. The same me
 bytes, wherever and whenever they are written.
 
 rosbags serialises one exemplar of a message. Further messages of the same shape differ from it only
-in numbers at fixed places. `MessageLayout` finds these places by CDR's alignment rules and writes
-columns directly into copies of the exemplar's bytes, tens of times faster than building and
-serialising messages one by one. Messages whose shape changes (texts, markers) go through rosbags
+in numbers at fixed places. `Exemplar` finds these places by CDR's alignment rules and writes
+columns directly into copies of its bytes, tens of times faster than building and serialising
+messages one by one. Messages whose shape changes (texts, markers) go through rosbags
 one by one.
 """
 
@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from mcap.writer import CompressionType
@@ -294,8 +294,7 @@ def serialise(message: Any) -> bytes:
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """The position of a number (or a run of them) in the serialised message."""
 
     offset: int
@@ -303,82 +302,57 @@ class Place:
     count: int
 
 
-@dataclass(frozen=True)
-class MessageLayout:
-    """The layout of a message: an exemplar's bytes, and the place of every number in them.
+class Exemplar:
+    """A message, from which others with its strings and sequence lengths are packed.
 
-    Places are named by path: `pose.pose.position.x`, `ranges` (the whole run),
+    Numbers are named by path: `pose.pose.position.x`, `ranges` (the whole run),
     `transforms[0].header.stamp` (a time is one place: int64 nanoseconds). When packing, `[]` stands
     for every item: `poses[].pose.position.x`.
     """
-
-    type_name: str
-    exemplar: bytes
-    places: Mapping[str, Place]
-
-    @classmethod
-    def of(cls, exemplar: Any) -> MessageLayout:
-        """Return the layout of all messages with the exemplar's strings and sequence lengths."""
-        places: dict[str, Place] = {}
-        data = serialise(exemplar)
-        end = _walk(exemplar, "", ENCAPSULATION_BYTES, places)
-        if end != len(data):  # rosbags and this file disagree about CDR: never write such bytes
-            raise ValueError(f"{exemplar.__msgtype__}: walked {end} of {len(data)} bytes")
-        return cls(exemplar.__msgtype__, data, places)
-
-    def pack(self, columns: Mapping[str, NDArray[Any]], rows: int) -> list[bytes]:
-        """Pack `rows` messages: the exemplar with the places in `columns` overwritten.
-
-        Each column is (rows,), or (rows, count) for a run and for `[]`.
-
-        Raises:
-            KeyError: the message has no such place.
-            ValueError: a column has the wrong shape.
-        """
-        table = np.tile(np.frombuffer(self.exemplar, np.uint8), (rows, 1))  # (rows, bytes)
-        for path, column in columns.items():
-            offsets, dtype = self._slots(path)
-            values = np.asarray(column)
-            wanted = (rows, len(offsets)) if len(offsets) > 1 or values.ndim > 1 else (rows,)
-            if values.shape != wanted:
-                raise ValueError(f"{self.type_name}.{path}: {values.shape}, not {wanted}")
-            values = split_stamps(values) if dtype == _STAMP else values.astype(dtype)
-            raw = np.ascontiguousarray(values).view(np.uint8)
-            where = offsets[:, None] + np.arange(dtype.itemsize)
-            table[:, where.ravel()] = raw.reshape(rows, where.size)
-        size = table.shape[1]
-        whole = table.tobytes()
-        return [whole[start : start + size] for start in range(0, len(whole), size)]
-
-    def _slots(self, path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
-        """Return the offset of every number at a path, and their type."""
-        if "[]" not in path:
-            place = self.places[path]
-            step = place.dtype.itemsize
-            return place.offset + step * np.arange(place.count), place.dtype
-        before, _, after = path.partition("[]")
-        places: list[Place] = []
-        while (place_of_item := self.places.get(f"{before}[{len(places)}]{after}")) is not None:
-            places.append(place_of_item)
-        if not places:
-            raise KeyError(path)
-        return np.array([place.offset for place in places]), places[0].dtype
-
-
-class Exemplar:
-    """A message whose layout is computed on first use, since typestores are slow to build."""
 
     def __init__(self, type_name: str, /, **fields: Any) -> None:
         self._type_name, self._fields = type_name, fields
 
     @functools.cached_property
-    def layout(self) -> MessageLayout:
-        """Return the layout of messages like this one."""
-        return MessageLayout.of(build(self._type_name, **self._fields))
+    def layout(self) -> tuple[bytes, Mapping[str, Place]]:
+        """Return the message's bytes and the places in them; typestores are slow to build."""
+        message = build(self._type_name, **self._fields)
+        places: dict[str, Place] = {}
+        data = serialise(message)
+        end = _walk(message, "", ENCAPSULATION_BYTES, places)
+        if end != len(data):  # rosbags and this file disagree about CDR: never write such bytes
+            raise ValueError(f"{self._type_name}: walked {end} of {len(data)} bytes")
+        return data, places
 
     def pack(self, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
-        """Pack one message per row of the columns, of which there is at least one."""
-        return self.layout.pack(columns, len(next(iter(columns.values()))))
+        """Pack a message per row of the columns, of which there is at least one.
+
+        Each column is (rows,), or (rows, count) for a run and for `[]`.
+        """
+        data, places = self.layout
+        rows, size = len(next(iter(columns.values()))), len(data)
+        table = np.tile(np.frombuffer(data, np.uint8), (rows, 1))  # (rows, bytes)
+        for path, column in columns.items():
+            offsets, dtype = _slots(places, path)
+            values = np.asarray(column)
+            values = split_stamps(values) if dtype == _STAMP else values.astype(dtype)
+            raw = np.ascontiguousarray(values).view(np.uint8)
+            where = offsets[:, None] + np.arange(dtype.itemsize)
+            table[:, where.ravel()] = raw.reshape(rows, where.size)
+        whole = table.tobytes()
+        return [whole[start : start + size] for start in range(0, len(whole), size)]
+
+
+def _slots(places: Mapping[str, Place], path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
+    """Return the offset of every number at a path, and their type."""
+    if "[]" not in path:
+        offset, dtype, count = places[path]
+        return offset + dtype.itemsize * np.arange(count), dtype
+    before, after = path.split("[]")
+    found: list[Place] = []
+    while (place := places.get(f"{before}[{len(found)}]{after}")) is not None:
+        found.append(place)
+    return np.array([place.offset for place in found]), found[0].dtype
 
 
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])

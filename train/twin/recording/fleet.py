@@ -16,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from msgspec.structs import replace
@@ -85,14 +84,8 @@ def schedule(
     drivers = _deal(FLEET, rng)
     while True:
         name, version = next(drivers).split() if driver == HANDOVER else (driver, version)
-        kind, mission_seed = next(kinds), int(rng.integers(1 << 31))
-        yield Mission(
-            EpisodeSpec(kind, mission_seed, _choose_hardware(hardware, mission_seed)),
-            name,
-            version,
-            handover=driver == HANDOVER and name == "planner",
-            pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
-        )
+        spec = EpisodeSpec(next(kinds), int(rng.integers(1 << 31)))
+        yield _staff(spec, name, version, hardware, rng, fleet=driver == HANDOVER)
 
 
 class OrderedMissions:
@@ -148,14 +141,8 @@ class OrderedMissions:
         if name == HANDOVER:
             name, version = next(self._drivers).split()
         spec = self.orders.spec(number, int(rng.integers(1 << 31)))
-        return Mission(
-            msgspec.structs.replace(spec, perturbation=_choose_hardware(self._hardware, spec.seed)),
-            name,
-            version,
-            handover=self._driver == HANDOVER and name == "planner",
-            pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
-            order=number,
-        )
+        fleet = self._driver == HANDOVER
+        return _staff(spec, name, version, self._hardware, rng, fleet=fleet, order=number)
 
 
 def meets(kind: str, true_conditions: Sequence[str]) -> bool:
@@ -165,10 +152,26 @@ def meets(kind: str, true_conditions: Sequence[str]) -> bool:
     )
 
 
-def _choose_hardware(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
-    if isinstance(hardware, Perturbation):
-        return hardware
-    return hardware.draw(np.random.default_rng([mission_seed, 1]))
+def _staff(
+    spec: EpisodeSpec,
+    name: str,
+    version: str,
+    hardware: Perturbation | Schedule,
+    rng: np.random.Generator,
+    *,
+    fleet: bool,
+    order: int | None = None,
+) -> Mission:
+    """Return the mission of a spec with a driver, hardware and a pause after it.
+
+    In a `fleet`, the operator takes over from planners. A schedule's hardware follows from the
+    mission's seed.
+    """
+    if isinstance(hardware, Schedule):
+        hardware = hardware.draw(np.random.default_rng([spec.seed, 1]))
+    pause_s = round(float(rng.uniform(*PAUSE_S)), 3)
+    spec = replace(spec, perturbation=hardware)
+    return Mission(spec, name, version, fleet and name == "planner", pause_s, order)
 
 
 def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
@@ -389,11 +392,10 @@ class Fleet:
         conditions: Mapping[str, float] | None = None,
         stops: bool = True,
         scan_hz: float = 10.0,
-        robots: int = ROBOTS,
     ) -> None:
         task = load_profile("warehouse_amr").task
         self.env = WarehouseVectorEnv(
-            robots,
+            ROBOTS,
             task=replace(task, bump_terminates=task.bump_terminates and stops),
             perturbation=hardware,
             layouts=layouts,
@@ -402,7 +404,7 @@ class Fleet:
         )
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
-        self._logs: list[_Log | None] = [None] * robots
+        self._logs: list[_Log | None] = [None] * ROBOTS
         self._motion: list[BodyState] = []  # states during the current step
         self._scan: F64 | None = None  # true ranges half-way through the current step
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)

@@ -39,37 +39,29 @@ JITTER_S = 4e-4  # maximum jitter of a sensor's timer, early or late
 TICK_TOLERANCE_S = 1e-6
 
 
-@dataclass(frozen=True)
-class Delay:
-    """The delay from measurement to publisher, and on to the recorder; both jitter."""
-
-    driver_ms: float
-    network_ms: float = 0.4
-
-
-DELAYS = {
-    "/odom": Delay(1.5),
-    "/imu": Delay(0.8),
-    "/joint_states": Delay(1.5),
-    "/scan": Delay(4.0),
-    "/bumper": Delay(1.0),
-    "/amcl_pose": Delay(5.0),
-    "/tf": Delay(1.5),
-    "/ground_truth/condition": Delay(7.0),
-    "/ground_truth/exposure": Delay(7.0),
-    "/ground_truth/perturbation": Delay(2.0),
-    "/ground_truth/markers": Delay(2.0),
-    "/ground_truth/traffic": Delay(7.0),
-    "/behaviour_policy": Delay(7.0),
-    "/goal_pose": Delay(2.0),
-    "/plan": Delay(6.0),
-    "/diagnostics": Delay(2.0),
-    "/tf_static": Delay(0.5),
-    "/map": Delay(0.5),
-    "/cmd_vel_nav": Delay(0.2),
-    "/cmd_vel": Delay(0.2),
+DRIVER_MS = {  # mean delay from a measurement until it is published, which jitters
+    "/odom": 1.5,
+    "/imu": 0.8,
+    "/joint_states": 1.5,
+    "/scan": 4.0,
+    "/bumper": 1.0,
+    "/amcl_pose": 5.0,
+    "/tf": 1.5,
+    "/ground_truth/condition": 7.0,
+    "/ground_truth/exposure": 7.0,
+    "/ground_truth/perturbation": 2.0,
+    "/ground_truth/markers": 2.0,
+    "/ground_truth/traffic": 7.0,
+    "/behaviour_policy": 7.0,
+    "/goal_pose": 2.0,
+    "/plan": 6.0,
+    "/diagnostics": 2.0,
+    "/tf_static": 0.5,
+    "/map": 0.5,
+    "/cmd_vel_nav": 0.2,
+    "/cmd_vel": 0.2,
 }
-MAX_NETWORK_MS = 3.0
+NETWORK_MS, MAX_NETWORK_MS = 0.4, 3.0  # on to the recorder: shortest usual delay, and longest
 TRAFFIC_HZ = 2.0  # rate of traffic messages while anyone moves
 
 
@@ -379,10 +371,9 @@ def send(
     The network is usually quick and sometimes slow, but never so slow that a measurement arrives
     after the command of its tick is sent.
     """
-    delay = DELAYS[topic]
     spread = 0.8 + 0.4 * rng.random((2, len(data)))
-    sent_ms = delay.driver_ms * spread[0]
-    network_ms = delay.network_ms * (spread[1] + rng.exponential(0.5, len(data)))
+    sent_ms = DRIVER_MS[topic] * spread[0]
+    network_ms = NETWORK_MS * (spread[1] + rng.exponential(0.5, len(data)))
     received_ms = sent_ms + np.minimum(network_ms, MAX_NETWORK_MS)
     publish = measured_ns + np.rint(sent_ms * 1e3).astype(np.int64) * 1000
     log = measured_ns + np.rint(received_ms * 1e3).astype(np.int64) * 1000

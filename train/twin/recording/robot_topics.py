@@ -36,7 +36,6 @@ from restock.train.twin.floors.layout import (
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.bag_writer import (
     Exemplar,
-    MessageLayout,
     Topic,
     build,
     serialise,
@@ -310,7 +309,7 @@ def transforms(
     return _TRANSFORMS.pack(columns)
 
 
-def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
+def static_transforms(stamp_ns: int, lidar_x_m: float) -> bytes:
     """Return the transforms of the lidar and the IMU on the robot."""
     return serialise(
         build(
@@ -321,7 +320,7 @@ def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -
                     "child_frame_id": frame,
                     "transform": {"translation": {"x": x, "z": z}},
                 }
-                for frame, x, z in ((LASER_FRAME, lidar_x_m, lidar_z_m), (IMU_FRAME, 0.0, 0.1))
+                for frame, x, z in ((LASER_FRAME, lidar_x_m, 0.2), (IMU_FRAME, 0.0, 0.1))
             ],
         )
     )
@@ -480,7 +479,7 @@ def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
     shown = on_floor(places)
     for seen in {tuple(row) for row in shown.tolist()}:
         rows = np.flatnonzero((shown == seen).all(axis=1))
-        layout = _traffic_layout(seen)
+        exemplar = _traffic(seen)
         agents = places[rows][:, np.array(seen, np.bool_)]
         columns: dict[str, NDArray[Any]] = {"markers[0].header.stamp": stamp_ns[rows]}
         for slot in range(agents.shape[1]):
@@ -493,7 +492,7 @@ def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
                 f"{at}.pose.orientation.z": np.sin(yaw / 2),
                 f"{at}.pose.orientation.w": np.cos(yaw / 2),
             }
-        for row, data in zip(rows.tolist(), layout.pack(columns, len(rows)), strict=True):
+        for row, data in zip(rows.tolist(), exemplar.pack(columns), strict=True):
             messages[row] = data
     return messages
 
@@ -504,7 +503,7 @@ def on_floor(places: F64) -> Bools:
 
 
 @functools.lru_cache(maxsize=64)
-def _traffic_layout(seen: tuple[bool, ...]) -> MessageLayout:
+def _traffic(seen: tuple[bool, ...]) -> Exemplar:
     wide = 2 * PERSON_RADIUS_M
     markers = [_delete_all(0)]
     for agent in np.flatnonzero(seen).tolist():
@@ -514,7 +513,7 @@ def _traffic_layout(seen: tuple[bool, ...]) -> MessageLayout:
             else ("forklift", _CUBE, tuple(2 * half for half in FORKLIFT_HALF_M), FORKLIFT)
         )
         markers.append(_marker(0, kind, agent, shape, (0.0, 0.0, 0.0), size, color))
-    return MessageLayout.of(build("visualization_msgs/msg/MarkerArray", markers=markers))
+    return Exemplar("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
 def _delete_all(stamp_ns: int) -> dict[str, Any]:
