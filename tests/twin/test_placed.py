@@ -9,7 +9,8 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.twin.env.drivers import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.placed import Drive, drive_of, on_free_ground, placed_on
+from restock.train.twin.floors.layout import is_free
+from restock.train.twin.floors.placed import Drive, drive_of, placed_on
 
 TASK = load_profile("warehouse_amr").task
 (FLOOR,) = open_floors("default")
@@ -38,7 +39,7 @@ def test_drive_matches_its_own_floor(drive: Drive) -> None:
 
 def test_other_walls_rule_a_floor_out(drive: Drive) -> None:
     hall = replace(FLOOR, racks=())  # open ground: all of its poses fit
-    assert on_free_ground(hall, drive.places_m).all()
+    assert is_free(hall, *drive.places_m.T).all()
     assert not placed_on(hall, drive)
     assert placed_on(hall, Drive(drive.places_m, np.empty((0, 2))))  # without a lidar
     assert not placed_on(OTHER, drive)

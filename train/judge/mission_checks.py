@@ -31,15 +31,9 @@ from restock.train.judge.fed_rows import (
     share_judged,
     shares_compared,
 )
-from restock.train.twin.floors.layout import Rect, Warehouse
+from restock.train.twin.floors.layout import Rect, Warehouse, from_walls_m, is_free
 from restock.train.twin.floors.occupancy_grid import into_frame
-from restock.train.twin.floors.placed import (
-    NEAR_M,
-    PLACED,
-    WITHIN_M,
-    from_walls_m,
-    on_free_ground,
-)
+from restock.train.twin.floors.placed import NEAR_M, PLACED, WITHIN_M
 
 LOST = "rows lost"
 NEARER = "goals come nearer"
@@ -185,13 +179,13 @@ def _check_floor(
     for floor in floors:
         own = into_frame(places, floor.map_origin)
         move = _best_move(floor, own[first])
-        near = from_walls_m(floor, own + move) < NEAR_M
+        near = from_walls_m(floor, *(own + move).T) < NEAR_M
         by_floor.append((float(near.mean()), floor, move, own, near))
     share, floor, move, own, near = max(by_floor, key=lambda one: one[0])
     driven = into_frame(rows.pose[np.isfinite(rows.pose).all(axis=1), :2], floor.map_origin)
     distance = float(np.hypot(*move))
     ranges = list(_check_ranges(rows, floor, move, twin))
-    if on_free_ground(floor, driven + move).mean() < PLACED or not ranges:
+    if is_free(floor, *(driven + move).T).mean() < PLACED or not ranges:
         reason = (
             f"these logs are of another floor ({share:.0%} of the lidar's returns lie on racks of"
             f" {floor.name!r}): `restock twin layout --from` makes that floor, and `restock"
@@ -199,7 +193,7 @@ def _check_floor(
         )
         yield not_run(FLOOR, what, reason)
         return
-    still = from_walls_m(floor, own) < NEAR_M
+    still = from_walls_m(floor, *own.T) < NEAR_M
     gains = _mean_by_mission(near.astype(float) - still, mission, ~first)
     better = ttest_1samp(gains, 0.0, alternative="greater")
     p = float(better.pvalue) if distance > MOVED_M and np.ptp(gains) > 0 else 1.0
@@ -347,7 +341,7 @@ def _best_move(floor: Warehouse, places: F64) -> F64:
         at = np.arange(-reach, reach + step / 2, step)
         moves = best + np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
         fits = [
-            float((from_walls_m(floor, places + move) < NEAR_M / 2).mean())
+            float((from_walls_m(floor, *(places + move).T) < NEAR_M / 2).mean())
             - 0.002 * float(np.hypot(*move))
             for move in moves
         ]

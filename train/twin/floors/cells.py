@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from restock.arrays import Bools, Ints
-from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
+from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse, is_free
 
 Cells = Bools  # (X, Y)
 Box = tuple[int, int, int, int]  # first and last column, first and last row; lasts are exclusive
@@ -25,6 +25,7 @@ EDGE_M = 0.15  # how far a corridor's side may wander: a map's racks are not str
 CROSSING_M = 2.0  # maximum length of a crossing beyond the end of an aisle segment
 GOAL_ROOM_M = 0.5  # minimum distance from a goal to the nearest obstacle
 GOALS = 200  # maximum number of goals
+SPACING_M = 1.0  # side of the squares of which each gets one goal
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,7 @@ def cells_of(floor: Warehouse, cell_m: float) -> Cells:
     """Return the free cells (X, Y) of a floor: those whose centre is outside all racks."""
     x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
     y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
-    free = np.ones((len(x), len(y)), np.bool_)
-    for rack in floor.racks:
-        inside_x = (rack.x_min <= x) & (x <= rack.x_max)
-        inside_y = (rack.y_min <= y) & (y <= rack.y_max)
-        free &= ~(inside_x[:, None] & inside_y[None, :])
-    return free
+    return is_free(floor, x[:, None], y[None, :])
 
 
 def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
@@ -146,11 +142,11 @@ def find_crossings(
 
 
 def find_goals(
-    free: Cells, cell_m: float, spacing_m: float = 1.0, room_m: float = GOAL_ROOM_M
+    free: Cells, cell_m: float, room_m: float = GOAL_ROOM_M
 ) -> tuple[tuple[float, float], ...]:
     """Choose up to GOALS places, evenly over the free cells, `room_m` or more from obstacles."""
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
-    stride = max(round(spacing_m / cell_m), 1)
+    stride = max(round(SPACING_M / cell_m), 1)
     places = []
     for i in range(0, free.shape[0], stride):
         for j in range(0, free.shape[1], stride):

@@ -280,6 +280,35 @@ def within(edges: F64, x_m: F64, y_m: F64, margin_m: float = 0.0) -> Bools:
     return inside
 
 
+def is_free(floor: Warehouse, x_m: F64, y_m: F64) -> Bools:
+    """Return which places, arrays of any shape, are on the floor and outside all racks."""
+    free: Bools = (x_m >= 0) & (x_m <= floor.width_m) & (y_m >= 0) & (y_m <= floor.depth_m)
+    for rack in floor.racks:
+        inside = (rack.x_min <= x_m) & (x_m <= rack.x_max)
+        free &= ~(inside & (rack.y_min <= y_m) & (y_m <= rack.y_max))
+    return free
+
+
+def from_walls_m(floor: Warehouse, x_m: F64, y_m: F64) -> F64:
+    """Return the distance of places, of any shape, to the next rack or wall; 0 in a rack."""
+    away = np.abs(np.stack([x_m, floor.width_m - x_m, y_m, floor.depth_m - y_m])).min(axis=0)
+    for rack in floor.racks:
+        away = np.minimum(away, box_distance(x_m, y_m, rack.center, rack.half_size, 0.0))
+    return np.asarray(away, np.float64)
+
+
+def box_distance(
+    x_m: F64, y_m: F64, center: tuple[float, float], half: tuple[float, float], yaw_rad: float
+) -> F64:
+    """Return the distance in metres from points to a box; 0 inside."""
+    dx, dy = x_m - center[0], y_m - center[1]
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    outside_x = np.maximum(np.abs(cos * dx + sin * dy) - half[0], 0.0)
+    outside_y = np.maximum(np.abs(cos * dy - sin * dx) - half[1], 0.0)
+    distance: F64 = np.hypot(outside_x, outside_y)
+    return distance
+
+
 Strip = tuple[float, float]
 
 
@@ -291,7 +320,6 @@ def strip_warehouse(
     *,
     name: str = DEFAULT,
     docks: tuple[Dock, ...] = (),
-    one_way: tuple[OneWay, ...] = (),
     open_racks: frozenset[int] = frozenset(),
 ) -> Warehouse:
     """Build a grid of racks between free strips: aisles (south, north), cross-aisles (west, east).
@@ -331,7 +359,6 @@ def strip_warehouse(
             for i, (west, east) in enumerate(cross_x_m)
         ),
         docks=docks,
-        one_way=one_way,
         name=name,
     )
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import duckdb
 import numpy as np
 
-from restock.arrays import F64, Bools
+from restock.arrays import F64
 from restock.ingest.task.surroundings import sector_returns
 from restock.ingest.task.task import Task, clearances_of
-from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.layout import Warehouse, from_walls_m, is_free
 from restock.train.twin.floors.occupancy_grid import into_frame
 
 PLACED = 0.8  # minimum share of poses on free ground
@@ -37,38 +37,18 @@ class Drive:
     returns_m: F64  # (M, 2); empty without a lidar
 
 
-def on_free_ground(floor: Warehouse, places_m: F64) -> Bools:
-    """Return which places (N, 2), in the floor's frame, are on it and outside all racks, (N,)."""
-    x, y = places_m.T
-    free: Bools = (x >= 0) & (x <= floor.width_m) & (y >= 0) & (y <= floor.depth_m)
-    for rack in floor.racks:
-        free &= ~((rack.x_min <= x) & (x <= rack.x_max) & (rack.y_min <= y) & (y <= rack.y_max))
-    return free
-
-
-def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
-    """Return the distance (N,) of places (N, 2), in the floor's frame, to the next rack or wall."""
-    x, y = places_m.T
-    away = np.abs(np.stack([x, floor.width_m - x, y, floor.depth_m - y])).min(axis=0)
-    for rack in floor.racks:
-        beside_x = np.maximum(np.maximum(rack.x_min - x, x - rack.x_max), 0.0)
-        beside_y = np.maximum(np.maximum(rack.y_min - y, y - rack.y_max), 0.0)
-        away = np.minimum(away, np.hypot(beside_x, beside_y))
-    return np.asarray(away, np.float64)
-
-
 def placed_on(floor: Warehouse, drive: Drive) -> bool:
     """Return whether a drive's log is in the frame of this floor's map; False without positions."""
     if not len(drive.places_m):
         return False
     places, returns = (
-        into_frame(part, floor.map_origin) for part in (drive.places_m, drive.returns_m)
+        into_frame(part, floor.map_origin).T for part in (drive.places_m, drive.returns_m)
     )
-    if float(on_free_ground(floor, places).mean()) < PLACED:
+    if float(is_free(floor, *places).mean()) < PLACED:
         return False
-    if len(returns) < MIN_RETURNS:
+    if len(drive.returns_m) < MIN_RETURNS:
         return True
-    return float((from_walls_m(floor, returns) < NEAR_M).mean()) >= SEEN
+    return float((from_walls_m(floor, *returns) < NEAR_M).mean()) >= SEEN
 
 
 COMPARED = 64  # maximum number of recordings whose frames are checked

@@ -20,7 +20,13 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from restock.arrays import F64, Bools, Ints, stacked
-from restock.train.twin.floors.layout import HEADINGS, ROOM_M, Warehouse
+from restock.train.twin.floors.layout import (
+    HEADINGS,
+    ROOM_M,
+    Warehouse,
+    box_distance,
+    from_walls_m,
+)
 
 CELL_M = 0.1
 PLAN_POINTS = 48
@@ -48,7 +54,7 @@ class Planner:
             round(self.warehouse.width_m / CELL_M),
             round(self.warehouse.depth_m / CELL_M),
         )
-        self._clearance_m = _rack_clearance(self.warehouse, self.shape)
+        self._clearance_m = from_walls_m(self.warehouse, *_cell_middles(self.shape))
         self._graph = self._build_graph(self._clearance_m)
         self._rule_free = (
             Planner(replace(self.warehouse, one_way=()), max(self.trees_kept // 8, 8))
@@ -257,34 +263,10 @@ def planners(floors: Sequence[Warehouse]) -> list[Planner]:
     return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
 
 
-def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
-    """Return the distance in metres from every cell's centre to the nearest rack or wall."""
-    x, y = _cell_middles(shape)
-    clearance = np.minimum(
-        np.minimum(x, warehouse.width_m - x), np.minimum(y, warehouse.depth_m - y)
-    )
-    for rack in warehouse.racks:
-        gap = box_distance(x, y, rack.center, rack.half_size, 0.0)
-        clearance = np.minimum(clearance, gap)
-    return clearance
-
-
 def _cell_middles(shape: tuple[int, int]) -> tuple[F64, F64]:
     x = (np.arange(shape[0]) + 0.5)[:, None] * CELL_M
     y = (np.arange(shape[1]) + 0.5)[None, :] * CELL_M
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
-
-
-def box_distance(
-    x_m: F64, y_m: F64, center: tuple[float, float], half: tuple[float, float], yaw_rad: float
-) -> F64:
-    """Return the distance in metres from points to a box; 0 inside."""
-    dx, dy = x_m - center[0], y_m - center[1]
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    outside_x = np.maximum(np.abs(cos * dx + sin * dy) - half[0], 0.0)
-    outside_y = np.maximum(np.abs(cos * dy - sin * dx) - half[1], 0.0)
-    distance: F64 = np.hypot(outside_x, outside_y)
-    return distance
 
 
 def smooth_plan(way: NDArray[Any]) -> F64:
@@ -292,8 +274,9 @@ def smooth_plan(way: NDArray[Any]) -> F64:
     return _resample(_smooth(way))
 
 
-def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
+def _smooth(way: NDArray[Any]) -> F64:
     """Average a path's cells over a moving window, which rounds off the grid's corners."""
+    half_window = 4  # cells
     if len(way) < 3:
         return way
     padded = np.zeros((len(way) + 2 * half_window + 1, 2))  # row 0 stays 0: sums start from it
