@@ -31,9 +31,15 @@ from restock.train.judge.fed_rows import (
     share_judged,
     shares_compared,
 )
-from restock.train.twin.floors.layout import Rect, Warehouse, from_walls_m, is_free
+from restock.train.twin.floors.layout import (
+    NEAR_RETURN_M,
+    ON_WALL_M,
+    Rect,
+    Warehouse,
+    from_walls_m,
+    is_free,
+)
 from restock.train.twin.floors.occupancy_grid import into_frame
-from restock.train.twin.floors.placed import NEAR_M, PLACED, WITHIN_M
 
 LOST = "rows lost"
 NEARER = "goals come nearer"
@@ -44,6 +50,7 @@ _JUMP = 0.06  # in units of 10 m; larger changes in one step mean that the plan 
 _STRAIGHT = 0.7  # with less distance from start to end per metre driven, a mission only wanders
 FLOOR = "floor"
 MOVED_M = 0.25
+PLACED = 0.8  # least share of poses on free ground, if the logs are of this floor
 _SEARCH_M, _STEP_M, _FINE_M = 2.5, 0.25, 0.05
 _RETURNS = 3000
 _MISSIONS = 6  # fewer missions with lidar returns are not compared with a floor
@@ -164,7 +171,7 @@ def _check_floor(
     clearance = rows.sectors() ** 2 * rows.task.range_max_m
     x, y = sector_returns(rows.task, clearance)
     placed = np.isfinite(np.asarray(rows.pose, np.float64)).all(axis=1, keepdims=True)
-    seen = (clearance < min(rows.task.range_max_m * (1 - 1e-6), WITHIN_M)) & placed
+    seen = (clearance < min(rows.task.range_max_m * (1 - 1e-6), NEAR_RETURN_M)) & placed
     cos, sin = np.cos(rows.pose[:, 2:]), np.sin(rows.pose[:, 2:])
     places = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + rows.pose[:, None, :2]
     mission = np.broadcast_to(rows.episode[:, None], seen.shape)[seen]
@@ -179,7 +186,7 @@ def _check_floor(
     for floor in floors:
         own = into_frame(places, floor.map_origin)
         move = _best_move(floor, own[first])
-        near = from_walls_m(floor, *(own + move).T) < NEAR_M
+        near = from_walls_m(floor, *(own + move).T) < ON_WALL_M
         by_floor.append((float(near.mean()), floor, move, own, near))
     share, floor, move, own, near = max(by_floor, key=lambda one: one[0])
     driven = into_frame(rows.pose[np.isfinite(rows.pose).all(axis=1), :2], floor.map_origin)
@@ -193,7 +200,7 @@ def _check_floor(
         )
         yield not_run(FLOOR, what, reason)
         return
-    still = from_walls_m(floor, *own.T) < NEAR_M
+    still = from_walls_m(floor, *own.T) < ON_WALL_M
     gains = _mean_by_mission(near.astype(float) - still, mission, ~first)
     better = ttest_1samp(gains, 0.0, alternative="greater")
     p = float(better.pvalue) if distance > MOVED_M and np.ptp(gains) > 0 else 1.0
@@ -229,7 +236,7 @@ def _check_ranges(
         if twin is not None:
             shown &= (twin.sectors() < 1.0).any(axis=0)  # sectors that the twin's lidar covers
         off = clearance - least
-        near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < NEAR_M
+        near = np.abs(off - (np.median(off[shown]) if shown.any() else 0.0)) < ON_WALL_M
         if (share := near[shown].sum() / max(shown.sum(), 1)) >= best:
             plain, away, alike, best = shown, off, near, share + _MIN_GAIN
     if best == ON_FLOOR:
@@ -341,7 +348,7 @@ def _best_move(floor: Warehouse, places: F64) -> F64:
         at = np.arange(-reach, reach + step / 2, step)
         moves = best + np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
         fits = [
-            float((from_walls_m(floor, *(places + move).T) < NEAR_M / 2).mean())
+            float((from_walls_m(floor, *(places + move).T) < ON_WALL_M / 2).mean())
             - 0.002 * float(np.hypot(*move))
             for move in moves
         ]

@@ -73,6 +73,8 @@ MAX_RACKS = 400
 ROOM_M = 0.3  # minimum distance from robot's middle to racks: half the stand-in's width, and more
 WAY_M = (4.0, 11.0)  # shortest and longest route of a mission
 BAY_M = 0.6  # distance between the goals along an aisle
+ON_WALL_M = 0.25  # a lidar return this near to a wall is on it
+NEAR_RETURN_M = 3.0  # returns farther from the lidar are off their wall if the yaw is imprecise
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ recording that the rows came from, if it still exists.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +36,6 @@ from restock.train.twin.floors.occupancy_grid import (
     UNKNOWN,
     OccupancyGrid,
 )
-from restock.train.twin.floors.placed import COMPARED, Drive, logged_drives
 from restock.train.twin.survey.mapping import PlacedScans, placed_scans
 from restock.train.twin.survey.poses import (
     WELL_PLACED,
@@ -117,13 +116,12 @@ _POSES = (
 
 @dataclass(frozen=True)
 class StoredDrive:
-    """The drive of one recording of a store, and those of the others with the same profile."""
+    """The drive of one recording of a store, and the poses of all with the same profile."""
 
     poses: Poses
     everywhere: Poses  # of all recordings with this profile; in one frame only if they share a map
     recording: Path | None  # its file; None if that no longer exists
     profile: Profile | None  # the profile of its ingest; None if unreadable
-    others: Mapping[str, Drive]  # source -> drive, of the largest other recordings
     notes: list[str] = field(default_factory=list)
 
 
@@ -149,18 +147,17 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
         source_text = f"poses of the rows of {counted(len(alike), 'recording')}"
         everywhere = _poses(store, [row[0] for row in alike], source_text)
         profile = _stored_profile(toml, source)
-        names = {row[0]: row[1] or row[0] for row in alike[:COMPARED] if row[0] != identity}
-        task = None if profile is None else profile.task
-        drives = logged_drives(store.connection, task, list(names))
-        others = {name: drives[one] for one, name in names.items()}
         poses = _poses(store, [identity], f"poses of the rows of {source}")
     file = Path(source) if source and Path(source).exists() else None
     notes = []
     if file is None:
         notes.append(f"{source} no longer exists: its map and its scans cannot be read")
     if len(rows) > 1:
-        notes.append(f"made from {source}, one of {len(rows)} recordings in the store")
-    return StoredDrive(poses, everywhere, file, profile, others, notes)
+        notes.append(
+            f"made from {source}, one of {len(rows)} recordings in the store: another may have a"
+            " frame of its own, for which --recording makes a floor"
+        )
+    return StoredDrive(poses, everywhere, file, profile, notes)
 
 
 def _find_recording(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
@@ -209,7 +206,6 @@ class Evidence:
     footprint: Footprint | None = None
     scans: list[PlacedScans] = field(default_factory=list)  # once per clock
     notes: list[str] = field(default_factory=list)
-    others: Mapping[str, Drive] = field(default_factory=dict)  # source -> drive of other recordings
 
 
 def gather(
@@ -240,7 +236,7 @@ def gather(
         if stored.recording is None:
             known = None if map_yaml is None else (read_grid(map_yaml), str(map_yaml))
             size = _profile_footprint(profile)
-            return Evidence(stored.poses, known, size, notes=notes, others=stored.others)
+            return Evidence(stored.poses, known, size, notes=notes)
         file = stored.recording
     with open_recording(file, definitions=definitions, salvage=True) as recording:
         known = _read_map(recording, map_yaml, notes, needed=with_map)
@@ -252,7 +248,7 @@ def gather(
         scans: list[PlacedScans] = []
         if with_scans and own is not None:
             scans = placed_scans(recording, own, profile, size)
-    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.others)
+    return Evidence(poses, known, size, scans, notes)
 
 
 def _is_on_map(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:

@@ -38,6 +38,7 @@ from restock.ingest.propose.pose_choice import mount_of, transform_edges
 from restock.ingest.propose.roles import KINDS, Kind, topics_for
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import angle_keys
+from restock.train.twin.floors.layout import NEAR_RETURN_M, ON_WALL_M
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
     OCCUPIED,
@@ -46,7 +47,6 @@ from restock.train.twin.floors.occupancy_grid import (
     into_frame,
     out_of_frame,
 )
-from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M, RETURNS, WITHIN_M
 from restock.train.twin.survey.poses import JUMP_M, Poses, Times, shared_clock
 
 BEAMS = 360  # scans with twice as many beams or more are thinned to about this number
@@ -360,14 +360,17 @@ def way_between(places_m: F64) -> F64:
     return np.concatenate(parts)
 
 
-def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
-    """Return the share of lidar returns within NEAR_M of an occupied cell of a map.
+MIN_RETURNS, RETURNS = 50, 4000  # fewest lidar returns that are compared with a map, and most
 
-    Returns farther than `WITHIN_M` from the lidar are ignored, as they move with errors of the
-    yaw. None if there are too few returns, or no walls.
+
+def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
+    """Return the share of lidar returns within ON_WALL_M of an occupied cell of a map.
+
+    Returns farther than NEAR_RETURN_M from the lidar are ignored. None if there are too few
+    returns, or no walls.
     """
     nearby = [
-        hit[np.hypot(*(hit - origin).T) < WITHIN_M]
+        hit[np.hypot(*(hit - origin).T) < NEAR_RETURN_M]
         for origin, hit in zip(scans.origin_m, scans.hit_m, strict=True)
     ]
     returns = np.concatenate([np.zeros((0, 2)), *nearby])
@@ -375,7 +378,7 @@ def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
     if len(returns) < MIN_RETURNS or not len(walls):
         return None
     apart = cKDTree(walls).query(returns[:: len(returns) // RETURNS + 1])[0]
-    return float((apart <= NEAR_M + grid.cell_m / 2).mean())
+    return float((apart <= ON_WALL_M + grid.cell_m / 2).mean())
 
 
 def _wall_middles(grid: OccupancyGrid) -> F64:

@@ -29,7 +29,6 @@ from restock.train.twin.floors.occupancy_grid import (
     floor_of_grid,
     out_of_frame,
 )
-from restock.train.twin.floors.placed import SEEN, placed_on
 from restock.train.twin.survey.evidence import Evidence, gather
 from restock.train.twin.survey.mapping import (
     PlacedScans,
@@ -52,7 +51,7 @@ MAX_OFF = 0.5  # if a larger share of the poses is off free floor, the map is no
 
 # Least share of lidar returns on a map's walls; with less, the poses are not in the map's frame.
 # Other people's robots with their own maps have .58 (badly localised) to 1.0.
-MIN_ON_WALLS = 0.5
+MIN_ON_WALLS, USUAL_ON_WALLS = 0.5, 0.7  # below the second, a note says so
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ class Surveyed:
     footprint: Footprint
     poses: Poses | None = None
     notes: list[str] = field(default_factory=list)
-    elsewhere: list[str] = field(default_factory=list)  # recordings of the store in other frames
 
     def facts(self) -> dict[str, Any]:
         """Return the survey as plain values, for people and JSON."""
@@ -80,8 +78,6 @@ class Surveyed:
             "robot": f"{self.footprint.length_m:.2f} x {self.footprint.width_m:.2f} m,"
             f" {self.footprint.source}",
         }
-        if self.elsewhere:
-            values["elsewhere"] = self.elsewhere
         if self.poses is not None:
             free = self.grid.at(self.poses.places_m) == FREE
             values |= {
@@ -146,15 +142,8 @@ def survey(
         turn_m=_turn_m(body),
         visited_m=None if poses is None else poses.places_m,
     )
-    floor = with_zones(made.floor)
-    elsewhere = [name for name, drive in evidence.others.items() if not placed_on(floor, drive)]
     notes += made.notes
-    if elsewhere:
-        notes.append(
-            f"{len(elsewhere)} of {len(evidence.others)} other recordings are in other frames:"
-            " their routes are not on this floor (--recording makes the floor of one)"
-        )
-    return Surveyed(floor, made.grid, how, source, body, poses, notes, elsewhere)
+    return Surveyed(with_zones(made.floor), made.grid, how, source, body, poses, notes)
 
 
 def _choose_grid(
@@ -287,7 +276,7 @@ def _check_walls(
             "with a pose in the map's frame, or make the floor --by scans (--by map uses this map "
             "without this check)",
         )
-    if agree < SEEN:
+    if agree < USUAL_ON_WALLS:
         notes.append(f"only {share}: the poses are imprecise, or the place has changed since")
 
 

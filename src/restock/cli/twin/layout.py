@@ -150,7 +150,7 @@ class LayoutCommand:
 
 def _show(name: str, facts: dict[str, Any]) -> None:
     notes = facts.get("notes", [])
-    rows = {key: value for key, value in facts.items() if key not in ("notes", "elsewhere")}
+    rows = {key: value for key, value in facts.items() if key != "notes"}
     texts = {key: value if isinstance(value, str) else cell(value) for key, value in rows.items()}
     output.print_table([{"": key, name: text} for key, text in texts.items()])  # text: left-aligned
     for note in notes:
