@@ -40,7 +40,13 @@ from restock.train.twin.floors.floors import (
     seeds_of,
     split_of,
 )
-from restock.train.twin.floors.layout import OneWay, Warehouse, default_warehouse
+from restock.train.twin.floors.layout import (
+    OneWay,
+    Warehouse,
+    default_warehouse,
+    edges_of,
+    within,
+)
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.missions import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec, describe_floor, draw_episode
@@ -229,7 +235,7 @@ def test_one_way_rules_reroute_without_trapping() -> None:
     around = ruled.plan(*start, goal)
     length = [float(np.hypot(*np.diff(way, axis=0).T).sum()) for way in (free, around)]
     assert length[1] > length[0] + 3.0
-    inside = [lane.contains(x, y) for x, y in around]
+    inside = within(edges_of([lane]), *around.T)[:, 0]
     assert not any(
         a and b and after[0] < before[0] - 1e-6
         for a, b, before, after in zip(inside, inside[1:], around, around[1:], strict=False)
@@ -319,12 +325,11 @@ def test_profile_and_warehouse_zones_match() -> None:
 
 def test_racks_fill_space_outside_aisles() -> None:
     floor = default_warehouse()
-    rng = np.random.default_rng(1)
-    for x, y in rng.uniform((0, 0), (floor.width_m, floor.depth_m), (400, 2)):
-        in_aisle = any(segment.area.contains(x, y) for segment in floor.segments)
-        in_cross = any(zone.contains(x, y) for _, zone in floor.cross_zones)
-        in_rack = any(rack.contains(x, y) for rack in floor.racks)
-        assert in_rack == (not in_aisle and not in_cross)
+    places = np.random.default_rng(1).uniform((0, 0), (floor.width_m, floor.depth_m), (400, 2)).T
+    aisles = [segment.area for segment in floor.segments]
+    ways = edges_of([*aisles, *(zone for _, zone in floor.cross_zones)])
+    in_rack = within(edges_of(floor.racks), *places).any(axis=1)
+    assert (in_rack == ~within(ways, *places).any(axis=1)).all()
 
 
 def test_point_belongs_to_its_aisle_segment() -> None:

@@ -74,7 +74,6 @@ def test_fit_and_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None
         ).fetchnumpy()
     assert len(cut) > 5
     assert np.array_equal(table["transition_id"], steps.transition_id)
-    assert np.array_equal(table["transition_id"][rows[:, 0]], cut.transition_id)
     assert np.array_equal(table["primary_condition"][rows].astype(str), cut.condition)
     for name in ("pose_x_m", "wheel_speed_mps"):
         stored = np.asarray(table[name], np.float64)

@@ -179,19 +179,11 @@ def fit_scope(
             refused["track_scale"] = (
                 "a robot that steers turns by its steering angle, so its track cannot be identified"
             )
-        if guessed:
-            notes.append(
-                f"{', '.join(guessed)} of the robot are not known: fitted values are relative to "
-                "a guess from its outline"
-            )
-        if "wheel_radius_m" not in guessed or "track_m" not in guessed:
-            reported = "wheel_radius_scale and track_scale are"
-            if robot.drive == "ackermann":
-                reported = "wheel_radius_scale is"
-            notes.append(
-                f"{reported} relative to the profile's robot; its odometry still uses the "
-                "profile's values, as in the log"
-            )
+        notes.append(
+            "fitted values are relative to the profile's robot"
+            + (f", of which {', '.join(guessed)} are guesses from its outline" if guessed else "")
+            + "; its odometry still uses the profile's values, as in the log"
+        )
     elif (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
         body = f"{task.body.length_m:g} x {task.body.width_m:g} m"
         why = f"the log's robot ({body}) is not the twin's: its mass and its contacts differ"

@@ -63,7 +63,6 @@ class LoggedSegments:
     horizon_steps: int  # K
     warmup_steps: int  # W
     row: Ints  # (S,) index of the first of the K steps in the `LoggedSteps`
-    transition_id: Ints  # (S,) ID of that first step
     recording_id: NDArray[np.str_]  # (S,)
     episode_id: NDArray[np.str_]  # (S,)
     condition: NDArray[np.str_]  # (S, K) the label of each step
@@ -76,7 +75,7 @@ class LoggedSegments:
     left_out: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.transition_id)
+        return len(self.row)
 
     @property
     def pose(self) -> F64:
@@ -149,7 +148,6 @@ def log_segments(
         horizon_steps=horizon,
         warmup_steps=warmup,
         row=at,
-        transition_id=steps.transition_id[at],
         recording_id=steps.recording_id[at],
         episode_id=steps.episode_id[at],
         condition=steps.condition[index[:, :-1]],

@@ -15,7 +15,7 @@ before slippery floor, all but gentle actions score less. A few percent of the a
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.task.surroundings import view_route
 from restock.state import Stateful
-from restock.train.twin.env.interface import Policy
+from restock.train.twin.env.interface import Policy, epsilon_greedy
 from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import PALLET_HALF_M, pallet_half_m
@@ -70,17 +70,13 @@ class SoftPolicy:
         """Return for which robots (N,) the policy never explores; none by default."""
         return np.zeros(env.num_envs, np.bool_)
 
-    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
+    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F32]:
         """Return actions (N,), some of them random, and their probabilities (N,)."""
         chosen = self.choose(env)
-        count = len(env.task.actions)
         epsilon = np.where(self.certain(env), 0.0, self.epsilon)
-        explores = self._rng.random(env.num_envs) < epsilon
-        action = np.where(explores, self._rng.integers(count, size=env.num_envs), chosen)
-        probability = np.where(action == chosen, 1 - epsilon, 0.0) + epsilon / count
         self.acting = np.full(env.num_envs, self.name, "U16")
         self.acting_version = np.full(env.num_envs, self.version, "U16")
-        return action, probability
+        return epsilon_greedy(chosen, len(env.task.actions), epsilon, self._rng)
 
 
 class RandomPolicy(SoftPolicy):
@@ -144,7 +140,7 @@ class Handover:
         self._slipping = np.zeros(count, np.int64)
         self._anchor = np.zeros((count, 3))
 
-    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
+    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, NDArray[Any]]:
         """Return the actions of each robot's current driver, and their probabilities."""
         if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)

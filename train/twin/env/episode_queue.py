@@ -28,7 +28,7 @@ from restock.train.twin.missions import KINDS, MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, refuse_unfit
 from restock.train.twin.physics.perturbation import Schedule
 
-TRIES = 300  # seeds that are tried for a route through a zone
+TRIES = 300  # seeds that are tried for a route through a zone, or for a block
 WAY_POINTS = 24  # number of points on each leg of a plan whose zones are looked up
 
 
@@ -134,7 +134,6 @@ def _list_some(names: list[Any]) -> str:
     return ", ".join(map(str, names[:12])) + (", …" if len(names) > 12 else "")
 
 
-BLOCK_TRIES = 300  # seeds that are tried for a block
 _PROBES = 24  # seeds that show which blocks a floor has room for
 
 
@@ -237,19 +236,19 @@ class MissionArms:
         """Return a mission of an arm, with its perturbation: the same for the same seed.
 
         Raises:
-            ConfigError: none of `BLOCK_TRIES` seeds gave the arm's block.
+            ConfigError: none of `TRIES` seeds gave the arm's block.
         """
         arm = self.arms[number]
         if arm.order >= 0 and self.orders is not None:
             return self.perturbed(self.orders.spec(arm.order, seed))
         rng = np.random.default_rng([seed, 3])
-        for _ in range(BLOCK_TRIES):
+        for _ in range(TRIES):
             spec = EpisodeSpec(arm.kind, seed)
             if not arm.block or self._block(spec) == arm.block:
                 return self.perturbed(spec)
             seed = int(rng.integers(1 << 31))
         raise ConfigError(
-            f"none of {BLOCK_TRIES} seeds gave a mission of {arm.name}",
+            f"none of {TRIES} seeds gave a mission of {arm.name}",
             where="practice",
             remedy="its floor hardly has room for it: give the kind no share",
         )

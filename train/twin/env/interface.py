@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.task.task import Signals
 from restock.toml import Checked
 
@@ -77,11 +77,11 @@ class LinearEpsilon(Checked, frozen=True):
 
 
 def epsilon_greedy(
-    greedy: NDArray[Any], actions: int, epsilon: float, rng: np.random.Generator
+    greedy: NDArray[Any], actions: int, epsilon: float | F64, rng: np.random.Generator
 ) -> tuple[Ints, F32]:
     """Replace greedy actions (N,) by random ones at rate `epsilon`; return them and probabilities.
 
-    The probabilities (N,) are those of the returned actions (N,).
+    The rate is one or (N,). The probabilities (N,) are those of the returned actions (N,).
     """
     explores = rng.random(len(greedy)) < epsilon
     uniform = rng.integers(actions, size=len(greedy))

@@ -99,13 +99,6 @@ class Rect:
     def half_size(self) -> tuple[float, float]:
         return (self.x_max - self.x_min) / 2, (self.y_max - self.y_min) / 2
 
-    def contains(self, x_m: float, y_m: float, margin_m: float = 0.0) -> bool:
-        """Return whether a point is inside, at least `margin_m` from every side."""
-        return (
-            self.x_min + margin_m <= x_m <= self.x_max - margin_m
-            and self.y_min + margin_m <= y_m <= self.y_max - margin_m
-        )
-
     @property
     def transposed(self) -> Rect:
         """Return the rectangle with x and y exchanged."""

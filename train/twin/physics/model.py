@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import mujoco
 import numpy as np
 
@@ -242,32 +243,20 @@ def robot_model(robot: Robot | None, body: Body) -> RobotModel:
     Raises:
         ConfigError: the robot's parts do not fit together, or it does not stand, drive or turn.
     """
-    return stand_in(body) if robot is None else _try_out(_Key(robot, body))
-
-
-class _Key:
-    """A robot and its outline, hashed by their content."""
-
-    def __init__(self, robot: Robot, body: Body) -> None:
-        self.robot, self.body = robot, body
-        self._text = repr((robot, body))
-
-    def __hash__(self) -> int:
-        return hash(self._text)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self._text == other._text
+    return stand_in(body) if robot is None else _try_out(msgspec.json.encode((robot, body)))
 
 
 @functools.lru_cache(maxsize=32)
-def _try_out(key: _Key) -> RobotModel:
-    robot = _settle(design(key.robot, key.body))
+def _try_out(described: bytes) -> RobotModel:
+    """Measure a robot in the physics; it and its outline are JSON, as a `Robot` has no hash."""
+    given, body = msgspec.json.decode(described, type=tuple[Robot, Body])
+    robot = _settle(design(given, body))
     speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
     ahead, _ = _drive(robot, speed, 0.0)
     # Scale the contact spheres, which sink in, so that the robot rolls on its wheels' radius.
     radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_radius_m(robot, ahead, speed)
     robot = _settle(replace(robot, contact_radius_m=radius))
-    if robot.drive == "skid_steer" and key.robot.track_ratio is None:
+    if robot.drive == "skid_steer" and given.track_ratio is None:
         turn = min(TRY_TURN, robot.speed_limit[1] / 2)
         for _ in range(3):
             _, turned = _drive(robot, 0.0, turn)

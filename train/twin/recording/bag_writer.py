@@ -18,6 +18,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Literal, NamedTuple, Protocol
@@ -37,8 +38,10 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
+from ruamel.yaml import YAML
 
 from restock.errors import RecordingError
 
@@ -240,25 +243,9 @@ def _qos(topic: Topic) -> Qos:
 
 def _qos_yaml(topic: Topic) -> str:
     """Return a QoS profile as rosbag2's MCAP storage writes it into a channel's metadata."""
-    qos = _qos(topic)
-    lines = [
-        f"- history: {qos.history.name.lower()}",
-        f"  depth: {qos.depth}",
-        f"  reliability: {qos.reliability.name.lower()}",
-        f"  durability: {qos.durability.name.lower()}",
-    ]
-    for name in ("deadline", "lifespan"):
-        time = getattr(qos, name)
-        lines += [f"  {name}:", f"    sec: {time.sec}", f"    nsec: {time.nsec}"]
-    lease = qos.liveliness_lease_duration
-    lines += [
-        f"  liveliness: {qos.liveliness.name.lower()}",
-        "  liveliness_lease_duration:",
-        f"    sec: {lease.sec}",
-        f"    nsec: {lease.nsec}",
-        "  avoid_ros_namespace_conventions: false",
-    ]
-    return "\n".join(lines) + "\n"
+    text = StringIO()
+    YAML().dump(dump_qos_v9([_qos(topic)]), text)
+    return text.getvalue()
 
 
 ENCAPSULATION_BYTES = 4  # a header; alignment counts from the byte after it
