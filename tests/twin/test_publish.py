@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from restock.train.twin.recording.bag_writer import Message, typestore
 from restock.train.twin.recording.publish import Rates, Robot
 from restock.train.twin.recording.recorder import NOISELESS
-from restock.train.twin.recording.robot_topics import TOPICS, Drive, Lidar, Motion, Odometer, Scene
+from restock.train.twin.recording.robot_topics import TOPICS, Drive, Lidar, Motion, Odometer
 
 START_NS = 1_772_000_000_000_000_000
 TYPES = {topic.name: topic.type_name for topic in TOPICS}
@@ -59,9 +59,12 @@ def _drive(rng: np.random.Generator) -> Drive:
         true_exposure=["nominal"] * 20,
         policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
         plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
-        scene=Scene(
-            np.zeros((0, 3)), np.zeros((0, 5)), np.zeros((1, 0, 3)), NOISELESS, 0.4, (0.7, 0.5, 0.3)
-        ),
+        pallets=np.zeros((0, 3)),
+        patches=np.zeros((0, 5)),
+        traffic=np.zeros((1, 0, 3)),
+        perturbation=NOISELESS,
+        goal_radius_m=0.4,
+        body_m=(0.7, 0.5, 0.3),
     )
 
 

@@ -41,7 +41,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import CHASSIS_Z_M
 from restock.train.twin.physics.simulation import BLOCK_S, BodyState
-from restock.train.twin.recording.robot_topics import Drive, Motion, Scene
+from restock.train.twin.recording.robot_topics import Drive, Motion
 
 HANDOVER = "handover"  # the fleet: planners, and an operator who takes over from them
 SCRIPTED = (HANDOVER, "planner", "operator", "random")
@@ -530,14 +530,12 @@ class Fleet:
             true_exposure=log.exposure,
             policy=log.policy,
             plans=log.plans,
-            scene=Scene(
-                pallets=log.pallets,
-                patches=log.patches,
-                traffic=np.array(log.traffic),
-                perturbation=log.hardware,
-                goal_radius_m=env.task.goal_radius_m,
-                body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
-            ),
+            pallets=log.pallets,
+            patches=log.patches,
+            traffic=np.array(log.traffic),
+            perturbation=log.hardware,
+            goal_radius_m=env.task.goal_radius_m,
+            body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
         )
         return DrivenMission(
             mission=log.mission,

@@ -156,7 +156,7 @@ class Robot:
 
     def _odometry(self, drive: Drive, reckoned: F64) -> list[Message]:
         times, tick = self._sample(drive, self.rates.odom)
-        hardware = drive.scene.perturbation
+        hardware = drive.perturbation
         rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
         rate += self.rng.normal(0, hardware.encoder_noise_radps, rate.shape)
         rate += hardware.encoder_bias_radps
@@ -171,7 +171,7 @@ class Robot:
 
     def _inertial(self, drive: Drive) -> list[Message]:
         times, tick = self._sample(drive, self.rates.imu)
-        hardware = drive.scene.perturbation
+        hardware = drive.perturbation
         gyro = drive.motion.at(drive.motion.yaw_rate_radps, times) + hardware.gyro_bias_radps
         gyro += self.rng.normal(0, hardware.gyro_noise_radps, len(times))
         accel = drive.motion.at(drive.motion.accel_mps2, times)
@@ -195,7 +195,7 @@ class Robot:
         return self._send("/joint_states", times, data)
 
     def _scans(self, drive: Drive) -> list[Message]:
-        scan_time_s = max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s)
+        scan_time_s = max(1 / self.rates.scan, drive.perturbation.lidar_period_s)
         ranges_m = _round(drive.ranges_m, LIDAR_LSB_M)
         data = topics.scans(self._stamps(drive.scan_s), ranges_m, self.lidar, scan_time_s)
         return self._send("/scan", drive.scan_s, data)
@@ -204,7 +204,7 @@ class Robot:
         """Return /amcl_pose, with the /tf by which the localiser corrects `odom` within `map`."""
         times, tick = self._sample(drive, self.rates.amcl_pose)
         age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
-        if drive.scene.perturbation.localisation_period_s:  # publish only new poses
+        if drive.perturbation.localisation_period_s:  # publish only new poses
             fresh = (tick >= 0) & (age_s[tick] == 0)
             times, tick = times[fresh], tick[fresh]
         seen = np.stack(
@@ -284,23 +284,19 @@ class Robot:
 
     def _scene(self, drive: Drive) -> list[Message]:
         """Return the perturbation and fixed markers once, and traffic on change, at its rate."""
-        scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
+        at, perturbation = np.zeros(1), topics.perturbation_text(drive.perturbation)
         due = np.diff(np.floor(drive.tick_s * TRAFFIC_HZ + 1e-6), prepend=-1) > 0
-        due = due[: len(scene.traffic)]
+        due = due[: len(drive.traffic)]
         ticks = np.flatnonzero(due)
-        places = scene.traffic[ticks]
+        places = drive.traffic[ticks]
         # The first message clears the markers of the previous mission.
         moved = np.ones(len(ticks), np.bool_)
         moved[1:] = (places[1:] != places[:-1]).any(axis=(1, 2))
         ticks, places = ticks[moved], places[moved]
         times = drive.tick_s[ticks]
         return [
-            *self._send(
-                topics.PERTURBATION, at, [topics.text(topics.perturbation_text(scene.perturbation))]
-            ),
-            *self._send(
-                topics.MARKERS, at, [topics.mission_markers(start_ns, scene, drive.goal_m)]
-            ),
+            *self._send(topics.PERTURBATION, at, [topics.text(perturbation)]),
+            *self._send(topics.MARKERS, at, [topics.mission_markers(self._stamp(0.0), drive)]),
             *self._send(topics.TRAFFIC, times, topics.traffic_markers(self._stamps(times), places)),
         ]
 

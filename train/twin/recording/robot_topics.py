@@ -77,18 +77,6 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """The obstacles, patches and traffic of one mission of T steps."""
-
-    pallets: F64  # (P, 3) x_m, y_m, yaw_rad; unused pallets are parked off the floor
-    patches: F64  # (K, 5) x_m, y_m, half sizes, friction; the size of unused patches is 0
-    traffic: F64  # (T + 1, A, 3) x_m, y_m, yaw_rad, the people first; parked while out of sight
-    perturbation: Perturbation
-    goal_radius_m: float
-    body_m: tuple[float, float, float]  # length, width, height of the robot
-
-
-@dataclass(frozen=True)
 class Drive:
     """A mission: true motion between the control ticks, and signals and actions at them.
 
@@ -106,7 +94,12 @@ class Drive:
     true_exposure: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which the plan holds, (P, 2) points)
-    scene: Scene
+    pallets: F64  # (P, 3) x_m, y_m, yaw_rad; unused pallets are parked off the floor
+    patches: F64  # (K, 5) x_m, y_m, half sizes, friction; the size of unused patches is 0
+    traffic: F64  # (T + 1, A, 3) x_m, y_m, yaw_rad, the people first; parked while out of sight
+    perturbation: Perturbation
+    goal_radius_m: float
+    body_m: tuple[float, float, float]  # length, width, height of the robot
 
 
 @dataclass
@@ -443,30 +436,21 @@ def perturbation_text(perturbation: Perturbation) -> str:
     return json.dumps({"name": perturbation.name, "values": perturbation.changed()})
 
 
-def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) -> bytes:
+def mission_markers(stamp_ns: int, drive: Drive) -> bytes:
     """Return a mission's fixed markers: goal, pallets, patches, and the robot's own body."""
-    length, width, height = scene.body_m
-    radius = 2 * scene.goal_radius_m
+    wide = 2 * drive.goal_radius_m
+    place, disc = (*drive.goal_m, 0.0), (wide, wide, THIN_M)
+    body: dict[str, Any] = {"frame": "base_link", "frame_locked": True}
     markers = [
         _delete_all(stamp_ns),
-        _marker(stamp_ns, "goal", 0, _CYLINDER, (*goal_m, 0.0), (radius, radius, THIN_M), GOAL),
-        _marker(
-            stamp_ns,
-            "robot",
-            0,
-            _CUBE,
-            (0.0, 0.0, 0.0),
-            (length, width, height),
-            ROBOT,
-            frame="base_link",
-            frame_locked=True,
-        ),
+        _marker(stamp_ns, "goal", 0, _CYLINDER, place, disc, GOAL),
+        _marker(stamp_ns, "robot", 0, _CUBE, (0.0, 0.0, 0.0), drive.body_m, ROBOT, **body),
     ]
-    for index, place in enumerate(scene.pallets[on_floor(scene.pallets)]):
+    for index, place in enumerate(drive.pallets[on_floor(drive.pallets)]):
         size = tuple(2 * half for half in PALLET_HALF_M)
         markers.append(_marker(stamp_ns, "pallet", index, _CUBE, tuple(place), size, PALLET))
     for index, (x, y, half_x, half_y, _) in enumerate(
-        scene.patches[scene.patches[:, 2] > NO_PATCH[2]]
+        drive.patches[drive.patches[:, 2] > NO_PATCH[2]]
     ):
         size = (2 * half_x, 2 * half_y, THIN_M)
         markers.append(_marker(stamp_ns, "patch", index, _CUBE, (x, y, 0.0), size, PATCH))
