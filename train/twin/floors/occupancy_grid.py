@@ -100,10 +100,8 @@ def with_missions(
 
     If the visited places are all close together, missions also go to places in `elsewhere`.
     """
-    near = connected(floor)
-    ways = _measure_routes(near)
-    made = _with_lengths(near, *ways)
-    longest_m = made.way_m[1] if len(ways[0]) else 0.0
+    made = fit_lengths(connected(floor))
+    longest_m = made.way_m[1]
     if longest_m >= NEAR_M or not elsewhere:
         return made
     step = max(len(elsewhere) // PLACES, 1)
@@ -111,7 +109,7 @@ def with_missions(
     if wider.way_m[1] < 1.5 * longest_m or not wider.starts_m:
         return made
     notes.append(
-        f"the robot's places are at most {longest_m or NEAREST_M:.1f} m apart:"
+        f"the robot's places are at most {longest_m:.1f} m apart:"
         f" missions start there and also go to {len(elsewhere[::step])} places that it could"
         " have reached"
     )
@@ -119,12 +117,7 @@ def with_missions(
 
 
 def fit_lengths(floor: Warehouse) -> Warehouse:
-    """Return the floor with mission lengths that its places allow: the usual ones if possible."""
-    return _with_lengths(floor, *_measure_routes(floor))
-
-
-def _measure_routes(floor: Warehouse) -> tuple[F64, F64]:
-    """Return the lengths and costs (N,), in metres, of routes that are long enough for missions."""
+    """Return the floor with mission lengths that fit its routes, if few are of usual length."""
     planner = Planner(floor, trees_kept=1)
     starts = [segment.area.center for segment in floor.starts]
     starts = starts[:: max(len(starts) // SAMPLE, 1)]
@@ -136,14 +129,9 @@ def _measure_routes(floor: Warehouse) -> tuple[F64, F64]:
                 way = planner.plan(*start, (x, y))
                 costs.append(away)
                 lengths.append(float(np.hypot(*np.diff(way, axis=0).T).sum()))
-    return np.array(lengths), np.array(costs)
-
-
-def _with_lengths(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
-    """Fit a floor's mission lengths to its routes (N,), unless enough are of usual length."""
-    if not len(length):
-        return floor
-    low, high = WAY_M
+    if not lengths:
+        return replace(floor, way_m=(NEAREST_M, NEAREST_M + 0.5))
+    (low, high), length, cost = WAY_M, np.array(lengths), np.array(costs)
     usual = (length >= low) & (length <= high) & (cost <= 1.3 * high)  # as in `draw_episode`
     if usual.mean() >= OFTEN:
         return floor
@@ -313,10 +301,8 @@ def floor_of_grid(
         room_m=room_m,
         starts_m=places,
     )
-    if places:
-        floor = with_missions(floor, elsewhere, notes)
-    elif visited_m is not None:
-        floor = fit_lengths(connected(floor))
+    if visited_m is not None:
+        floor = with_missions(floor, elsewhere if places else (), notes)
     return GridFloor(floor, grid, notes)
 
 

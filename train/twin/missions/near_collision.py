@@ -20,15 +20,7 @@ PASSING_M = 0.6  # from the plan to the side of a waiting person: half the robot
 
 
 def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged | None:
-    """Stage people and forklifts on the plan; None if none fits."""
-    walks = draw_walks(rng, warehouse, plan)
-    return None if walks is None else Staged(walks=walks)
-
-
-def draw_walks(
-    rng: np.random.Generator, warehouse: Warehouse, plan: F64
-) -> tuple[Walk | None, ...] | None:
-    """Draw one or two people and perhaps a forklift on the robot's route; None if none fits."""
+    """Stage one or two people and perhaps a forklift on the plan; None if none fits."""
     walks: list[Walk | None] = [None] * AGENTS
     crossings = _find_crossings(plan, warehouse)
     for slot in range(1 + int(rng.random() < 0.35)):
@@ -41,7 +33,7 @@ def draw_walks(
     if crossings and rng.random() < 0.65:  # only about half of these find room
         place = crossings[rng.integers(len(crossings))]
         walks[PEOPLE] = _draw_crossing(rng, warehouse, plan, place, 0.6)
-    return tuple(walks) if any(walk is not None for walk in walks) else None
+    return Staged(walks=tuple(walks)) if any(walk is not None for walk in walks) else None
 
 
 def _find_crossings(plan: F64, warehouse: Warehouse) -> list[int]:

@@ -12,12 +12,7 @@ PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
 
 
 def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged:
-    """Stage oily patches along the plan."""
-    return Staged(patches=_draw_patches(rng, plan))
-
-
-def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
-    """Draw oily patches before and in the sharpest turn, and mostly also at the start and goal.
+    """Stage oily patches before and in the sharpest turn, and mostly also at the start and goal.
 
     Some patches lie under the wheels of one side only, which turns a robot that accelerates or
     brakes.
@@ -39,7 +34,7 @@ def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
             at = at + normal * rng.choice([-1.0, 1.0]) * wide
         half = (long, wide) if abs(ahead[0]) > abs(ahead[1]) else (wide, long)
         patches[row] = (*at, *half, rng.uniform(*PATCH_FRICTION))
-    return patches
+    return Staged(patches=patches)
 
 
 def _sharpest_turn(plan: F64) -> float:
