@@ -55,7 +55,6 @@ from restock.train.twin.calibration.open_loop import (
     ordinary_driving,
     replay_segments,
     split_at,
-    whole_periods_s,
 )
 from restock.train.twin.physics.perturbation import Perturbation
 
@@ -163,7 +162,7 @@ def fit(
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
     """Cut segments; draw at most `max_segments` with ordinary driving that are not held out."""
     steps = logged_steps(store, config.task_hash, config.recordings)
-    segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
+    segments = log_segments(steps, config.horizon_s)
     if not len(segments):
         why = ", ".join(f"{steps} {reason}" for reason, steps in segments.left_out.items())
         raise StoreError(

@@ -60,6 +60,7 @@ from restock.train.twin.calibration.open_loop import (
 from restock.train.twin.calibration.path_gap import (
     QUANTITIES,
     PathGap,
+    draw_per_condition,
     path_gap,
 )
 from restock.train.twin.calibration.twin_gap import (
@@ -234,7 +235,10 @@ def measure_gap(
         paths.append(path_gap(steps, horizon, twins, config))
     report("one step from each logged state")
     rng = np.random.default_rng([config.seed, 2])
-    rows, chosen = _steps_to_compare(steps, 5 * config.max_segments, rng)
+    followed = {name: holds & steps.followed for name, holds in steps.conditions.items()}
+    drawn = draw_per_condition(followed, 5 * config.max_segments, rng)
+    rows = np.flatnonzero(np.any(list(drawn.values()), axis=0))
+    chosen = {name: mask[rows] for name, mask in drawn.items()}
     stepped = one_step(store, steps, rows, twins, config)
     path_rows = list(_path_rows(paths, rng))
     observation_rows = list(_observation_rows(steps, stepped, chosen, rng))
@@ -262,19 +266,6 @@ def measure_gap(
         verdicts=_verdicts(steps, config.limits, judged, path_rows, ratios),
         not_done=tuple(_not_done(store, steps, twins, stepped, paths)),
     )
-
-
-def _steps_to_compare(
-    steps: LoggedSteps, most: int, rng: np.random.Generator
-) -> tuple[Ints, dict[str, Bools]]:
-    """Draw at most `most` rows per condition; return the rows, and a mask of them by condition."""
-    masks = {}
-    for name, holds in steps.conditions.items():
-        mask, members = np.zeros(len(steps), np.bool_), np.flatnonzero(holds & steps.followed)
-        mask[rng.permutation(members)[:most]] = True
-        masks[name] = mask
-    rows = np.flatnonzero(np.any(list(masks.values()), axis=0))
-    return rows, {name: mask[rows] for name, mask in masks.items()}
 
 
 def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[str, Any]]:

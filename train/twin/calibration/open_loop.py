@@ -108,7 +108,7 @@ def log_segments(
     period.
 
     Raises:
-        ConfigError: the horizon or stride is not a multiple of the control period.
+        ConfigError: the horizon or stride is over 5 % off a multiple of the control period.
     """
     task, rows = steps.task, steps.now
     horizon = _periods(task, horizon_s, "horizon_s")
@@ -246,24 +246,18 @@ def _find_fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
     return fresh
 
 
-def whole_periods_s(task: Task, seconds: float) -> float:
-    """Round a duration to whole control periods; return it unchanged if that is over 5 % off."""
-    period_s = task.control_period_s
-    whole = round(max(round(seconds / period_s), 1) * period_s, 6)
-    return whole if abs(whole - seconds) <= 0.05 * seconds else seconds
-
-
 def warmup_steps(task: Task) -> int:
     """Return the number of control periods in `WARMUP_S`, rounded up."""
     return int(np.ceil(WARMUP_S / task.control_period_s - 1e-9))
 
 
 def _periods(task: Task, seconds: float, name: str) -> int:
-    count = round(seconds / task.control_period_s)
-    if count < 1 or abs(count * task.control_period_s - seconds) > 1e-6:
+    """Convert a duration to control periods. Raises ConfigError if that is over 5 % off."""
+    period_s = task.control_period_s
+    count = max(round(seconds / period_s), 1)
+    if abs(count * period_s - seconds) > 0.05 * seconds:
         raise ConfigError(
-            f"{name} must be a multiple of the control period of {task.control_period_s} s,"
-            f" got {seconds}",
+            f"{name} must be a multiple of the control period of {period_s} s, got {seconds}",
             where="segments",
         )
     return count

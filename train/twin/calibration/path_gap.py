@@ -19,7 +19,6 @@ from restock.train.twin.calibration.open_loop import (
     LoggedSegments,
     log_segments,
     replay_segments,
-    whole_periods_s,
 )
 from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.physics.perturbation import Perturbation
@@ -55,13 +54,23 @@ def path_gap(
 ) -> PathGap:
     """Replay segments of `horizon_s` that overlap by half, and measure their gaps.
 
-    For poses, the gap is measured at the segment's end. For signals, it is the root mean square
-    over the segment.
+    A segment counts for every condition that holds at any of its steps, and for `nominal` if none
+    does. At most `max_segments` are drawn per condition. For poses, the gap is measured at the
+    segment's end. For signals, it is the root mean square over the segment.
 
     Raises:
         ConfigError: the horizon is not a multiple of the control period.
     """
-    cut, chosen = overlapping_segments(steps, horizon_s, config)
+    period = steps.task.control_period_s
+    stride_s = max(round(horizon_s / 2 / period), 1) * period
+    cut = log_segments(steps, horizon_s, stride_s=stride_s)
+    rows = cut.row[:, None] + np.arange(cut.horizon_steps)
+    holds = {
+        name: held[rows].all(axis=1) if name == NOMINAL else held[rows].any(axis=1)
+        for name, held in steps.conditions.items()
+    }
+    rng = np.random.default_rng([config.seed, cut.horizon_steps])
+    chosen = draw_per_condition(holds, config.max_segments, rng)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
     parts = [
         _gaps(cut.take(used[begin : begin + _AT_ONCE]), twins, config)
@@ -76,37 +85,15 @@ def path_gap(
     )
 
 
-def overlapping_segments(
-    steps: LoggedSteps, horizon_s: float, config: GapConfig
-) -> tuple[LoggedSegments, dict[str, Bools]]:
-    """Cut segments of `horizon_s` that overlap by half; return them and a mask (S,) by condition.
-
-    A segment counts for every condition that holds at any of its steps, and for `nominal` if none
-    does. At most `max_segments` are drawn per condition.
-
-    Raises:
-        ConfigError: the horizon is not a multiple of the control period.
-    """
-    period = steps.task.control_period_s
-    stride_s = max(round(horizon_s / 2 / period), 1) * period
-    cut = log_segments(steps, whole_periods_s(steps.task, horizon_s), stride_s=stride_s)
-    rng = np.random.default_rng([config.seed, cut.horizon_steps])
-    return cut, _choose(steps, cut, config.max_segments, rng)
-
-
-def _choose(
-    steps: LoggedSteps, cut: LoggedSegments, most: int, rng: np.random.Generator
+def draw_per_condition(
+    holds: Mapping[str, Bools], most: int, rng: np.random.Generator
 ) -> dict[str, Bools]:
-    """Draw at most `most` segments of each condition; return their masks (S,)."""
-    rows = cut.row[:, None] + np.arange(cut.horizon_steps)
-    chosen = {}
-    for name, holds in steps.conditions.items():
-        mask = holds[rows].all(axis=1) if name == NOMINAL else holds[rows].any(axis=1)
-        members = np.flatnonzero(mask)
-        if len(members) > most:
-            mask[rng.permutation(members)[most:]] = False
-        chosen[name] = mask
-    return chosen
+    """Draw at most `most` of the rows (N,) for which each condition holds; return their masks."""
+    drawn = {}
+    for name, mask in holds.items():
+        drawn[name] = np.zeros(len(mask), np.bool_)
+        drawn[name][rng.permutation(np.flatnonzero(mask))[:most]] = True
+    return drawn
 
 
 def _gaps(
