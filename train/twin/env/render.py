@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageOps
 
 from restock.arrays import F64, Bools
 from restock.errors import ConfigError
@@ -18,10 +18,14 @@ from restock.train.twin.floors.layout import (
     PATCHES,
     PEOPLE,
     PERSON_RADIUS_M,
-    Rect,
     Warehouse,
 )
-from restock.train.twin.floors.occupancy_grid import OCCUPIED, OccupancyGrid, into_frame
+from restock.train.twin.floors.occupancy_grid import (
+    OCCUPIED,
+    OccupancyGrid,
+    into_frame,
+    out_of_frame,
+)
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -53,14 +57,14 @@ def draw_floor(
         (RACK, floor.racks),
     ):
         for area in areas:
-            canvas.fill(area, color)
+            canvas.box(*area.center, *area.half_size, 0.0, color)
     if grid is not None:
         canvas.cells(grid.occupancy == OCCUPIED, grid.cell_m, MAP_WALL)
     if driven_m is not None:
         for x, y in into_frame(driven_m, floor.map_origin).tolist():
             canvas.disc(x, y, 0.03, ROBOT)
     for x, y in floor.goals.tolist():
-        canvas.fill(Rect(x - 0.06, y - 0.06, x + 0.06, y + 0.06), MAP_GOAL)
+        canvas.box(x, y, 0.06, 0.06, 0.0, MAP_GOAL)
     for rule in floor.one_way:
         canvas.arrow(*rule.area.center, HEADINGS[rule.heading], ONE_WAY)
     return canvas.pixels(wall=4)
@@ -76,8 +80,7 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
         canvas.box(x, y, half_x, half_y, 0.0, ICE)
     for rack in floor.racks:
         canvas.box(*rack.center, *rack.half_size, 0.0, RACK)
-    for x, y in _dense(env.navigation.plans_m[index]):
-        canvas.disc(x, y, 0.03, ROUTE)
+    canvas.line(env.navigation.plans_m[index], ROUTE)
     goal_x, goal_y = env.navigation.goals_m[index]
     canvas.disc(goal_x, goal_y, env.task.goal_radius_m, MAP_GOAL)
     for x, y, yaw in sim.pallets[index]:
@@ -97,67 +100,46 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
 
 
 class _Canvas:
-    """The pixels of a floor; the first row is the southernmost."""
+    """A picture of a floor; the first row is the southernmost until it is read as `pixels`."""
 
     def __init__(self, floor: Warehouse, pixels_per_m: int) -> None:
-        height, width = round(floor.depth_m * pixels_per_m), round(floor.width_m * pixels_per_m)
-        self._image = np.empty((height, width, 3), np.uint8)
-        self._image[:] = FLOOR
         self._scale = pixels_per_m
-        self._x = (np.arange(width) + 0.5) / pixels_per_m
-        self._y = (np.arange(height) + 0.5) / pixels_per_m
-
-    def fill(self, area: Rect, color: Pixel) -> None:
-        """Fill an axis-aligned box, its edges rounded to whole pixels."""
-        x0, y0, x1, y1 = (round(edge * self._scale) for edge in area.edges)
-        self._image[y0:y1, x0:x1] = color
+        size = round(floor.width_m * pixels_per_m), round(floor.depth_m * pixels_per_m)
+        self._image = Image.new("RGB", size, FLOOR)
+        self._draw = ImageDraw.Draw(self._image)
 
     def cells(self, cells: Bools, cell_m: float, color: Pixel) -> None:
-        """Fill the pixels whose centres are in these cells (X, Y), from the south-west corner."""
-        column, row = (
-            np.minimum((at / cell_m).astype(np.int64), size - 1)
-            for at, size in zip((self._x, self._y), cells.shape, strict=True)
-        )
-        self._image[cells[np.ix_(column, row)].T] = color
+        """Fill cells (X, Y), which begin in the south-west corner."""
+        size = [max(round(count * cell_m * self._scale), 1) for count in cells.shape]
+        mask = Image.fromarray(np.where(cells.T, np.uint8(255), np.uint8(0)))
+        mask = mask.resize((size[0], size[1]), Image.Resampling.NEAREST)
+        self._image.paste(color, (0, 0, *size), mask)
 
     def box(
         self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: Pixel
     ) -> None:
-        window, dx, dy = self._window(x, y, float(np.hypot(half_x, half_y)))
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
-        self._image[window][inside] = color
+        corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * (half_x, half_y)
+        self._polygon(out_of_frame(corners, (x, y, yaw)), color)
 
     def disc(self, x: float, y: float, radius: float, color: Pixel) -> None:
-        window, dx, dy = self._window(x, y, radius)
-        self._image[window][dx * dx + dy * dy <= radius * radius] = color
+        ends = [at * self._scale for at in (x - radius, y - radius, x + radius, y + radius)]
+        self._draw.ellipse(ends, fill=color)
+
+    def line(self, points_m: F64, color: Pixel) -> None:
+        self._draw.line((points_m * self._scale).ravel().tolist(), fill=color, width=2)
 
     def arrow(self, x: float, y: float, heading: tuple[int, int], color: Pixel) -> None:
         """Draw a triangle around a place, pointing along `heading`."""
-        window, dx, dy = self._window(x, y, 0.4)
-        ahead = heading[0] * dx + heading[1] * dy
-        aside = np.abs(heading[1] * dx - heading[0] * dy)
-        inside = (ahead > -0.35) & (ahead < 0.35) & (aside < (0.35 - ahead) / 2)
-        self._image[window][inside] = color
+        yaw = float(np.arctan2(heading[1], heading[0]))
+        corners = np.array([(-0.35, 0.35), (-0.35, -0.35), (0.35, 0.0)])
+        self._polygon(out_of_frame(corners, (x, y, yaw)), color)
 
-    def _window(self, x: float, y: float, reach: float) -> tuple[tuple[slice, slice], F64, F64]:
-        columns = slice(*np.searchsorted(self._x, [x - reach, x + reach]))
-        rows = slice(*np.searchsorted(self._y, [y - reach, y + reach]))
-        return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
+    def _polygon(self, corners: F64, color: Pixel) -> None:
+        self._draw.polygon((corners * self._scale).ravel().tolist(), fill=color)
 
     def pixels(self, wall: int = 0) -> NDArray[np.uint8]:
         """Return the pixels (H, W, 3), north first, with this many pixels of wall around."""
-        height, width, _ = self._image.shape
-        framed = np.empty((height + 2 * wall, width + 2 * wall, 3), np.uint8)
-        framed[:] = MAP_WALL
-        framed[wall : wall + height, wall : wall + width] = self._image[::-1]
-        return framed
-
-
-def _dense(plan_m: F64) -> F64:
-    """Return a polyline with three more points in every segment."""
-    share = np.arange(4)[None, :, None] / 4
-    return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)
+        return np.array(ImageOps.expand(ImageOps.flip(self._image), wall, MAP_WALL))
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
