@@ -37,7 +37,6 @@ from restock.train.twin.recording.fleet import (
     SCRIPTED,
     VERSIONS,
     BehaviourPolicies,
-    DrivenMission,
     ExternalPolicy,
     Fleet,
     Mission,
@@ -260,31 +259,26 @@ def record(
     driver, version = plan.policy, VERSIONS.get(plan.policy, "1")
     if policy is not None:
         driver, version = policy.name, policy.version
-    missions: OrderedMissions | Iterator[Mission]
+    ordered: OrderedMissions | None = None
+    rounds: Iterator[Iterator[Mission]]
     if isinstance(plan.missions, MissionsFile):
-        missions = OrderedMissions(
-            MissionOrders(
-                plan.orders(),
-                fleet.env.floors,
-                fleet.env.navigation.planners,
-                where="the missions file",
-            ),
-            plan.missions,
-            plan.seed,
-            driver,
-            plan.hardware,
+        floors, planners = fleet.env.floors, fleet.env.navigation.planners
+        ordered = OrderedMissions(
+            MissionOrders(plan.orders(), floors, planners, where="the missions file"),
+            *(plan.missions, plan.seed, driver, plan.hardware),
             version=version,
         )
+        rounds = ordered.rounds()
     else:
         endless = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
-        missions = islice(endless, plan.missions)
+        rounds = iter([islice(endless, plan.missions)])
     drivers = BehaviourPolicies(
         fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, external=external
     )
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS, plan.tags) as sink:
         floor: Warehouse | None = None
-        for driven in _drive(fleet, missions, drivers):
+        for driven in (one for missions in rounds for one in fleet.drive(missions, drivers)):
             if driven.floor is not floor:  # send the map once, and again on another floor
                 floor = driven.floor
                 racks = ~cells_of(floor, MAP_CELL_M).T
@@ -298,9 +292,12 @@ def record(
             summary.topics.update(message.topic for message in messages)
             seconds = float(driven.drive.tick_s[-1])
             kind = driven.mission.spec.condition
+            observed = meets(kind, driven.drive.true_condition)
+            if ordered is not None:
+                ordered.note(driven.mission, observed=observed)
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
-            summary.observed[kind] += meets(kind, driven.drive.true_condition)
+            summary.observed[kind] += observed
             summary.steps.update(map(primary_of, driven.drive.true_condition))
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
@@ -313,19 +310,6 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
-
-
-def _drive(
-    fleet: Fleet, missions: OrderedMissions | Iterator[Mission], drivers: BehaviourPolicies
-) -> Iterator[DrivenMission]:
-    if not isinstance(missions, OrderedMissions):
-        yield from fleet.drive(missions, drivers)
-        return
-    for one_round in missions.rounds():
-        for driven in fleet.drive(one_round, drivers):
-            kind = driven.mission.spec.condition
-            missions.note(driven.mission, observed=meets(kind, driven.drive.true_condition))
-            yield driven
 
 
 def parse_start(text: str) -> int:
