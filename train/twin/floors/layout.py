@@ -13,10 +13,11 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
@@ -275,7 +276,7 @@ def within(edges: F64, x_m: F64, y_m: F64, margin_m: float = 0.0) -> Bools:
     return inside
 
 
-def is_free(floor: Warehouse, x_m: F64, y_m: F64) -> Bools:
+def is_free(floor: Warehouse, x_m: NDArray[Any], y_m: NDArray[Any]) -> Bools:
     """Return which places, arrays of any shape, are on the floor and outside all racks."""
     free: Bools = (x_m >= 0) & (x_m <= floor.width_m) & (y_m >= 0) & (y_m <= floor.depth_m)
     for rack in floor.racks:

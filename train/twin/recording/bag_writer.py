@@ -286,7 +286,7 @@ class Place(NamedTuple):
 
     offset: int
     dtype: np.dtype[Any]
-    count: int
+    size: int  # how many numbers
 
 
 class Exemplar:
@@ -333,8 +333,8 @@ class Exemplar:
 def _slots(places: Mapping[str, Place], path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
     """Return the offset of every number at a path, and their type."""
     if "[]" not in path:
-        offset, dtype, count = places[path]
-        return offset + dtype.itemsize * np.arange(count), dtype
+        offset, dtype, size = places[path]
+        return offset + dtype.itemsize * np.arange(size), dtype
     before, after = path.split("[]")
     found: list[Place] = []
     while (place := places.get(f"{before}[{len(found)}]{after}")) is not None:
