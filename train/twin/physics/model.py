@@ -44,7 +44,7 @@ from restock.train.twin.physics.robot_model import (
     design,
     stand_in,
 )
-from restock.train.twin.physics.robot_parts import add_robot, wheels_of
+from restock.train.twin.physics.robot_parts import add_robot, wheel_names
 
 # Half sizes of the mocap bodies (M, 3), in the model's order; a person is a cylinder.
 MOVING_HALF_M = np.repeat(
@@ -195,15 +195,18 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
         first = int(model.body(f"{kind}_0").mocapid[0])
         return slice(first, first + count)
 
-    wheels = wheels_of(model, robot)
+    wheels = [f"{name}_wheel" for name in wheel_names(robot)]
+    joints = [model.joint(f"{name}_joint") for name in wheels]
+    sides = ("left", "right") if robot.steers else ()
+    steering = [model.joint(f"front_{side}_steering") for side in sides]
     accelerometer = int(model.sensor("accelerometer").adr[0])
     return Handles(
         chassis_body=int(model.geom_bodyid[model.geom("chassis").id]),
-        wheel_bodies=tuple(wheels.bodies),
-        wheel_geoms=tuple(wheels.geoms),
-        wheel_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in wheels.joints),
-        wheel_qvel=tuple(int(model.jnt_dofadr[joint]) for joint in wheels.joints),
-        steering_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in wheels.steering),
+        wheel_bodies=tuple(model.body(name).id for name in wheels),
+        wheel_geoms=tuple(model.geom(name).id for name in wheels),
+        wheel_qpos=tuple(int(joint.qposadr[0]) for joint in joints),
+        wheel_qvel=tuple(int(joint.dofadr[0]) for joint in joints),
+        steering_qpos=tuple(int(joint.qposadr[0]) for joint in steering),
         building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),
@@ -373,8 +376,8 @@ def _drive(
 ) -> tuple[float, float]:
     """Return the steady speed (m/s) and yaw rate (rad/s) under a command."""
     model = build_robot_alone(robot, TIMESTEP_S)
-    for geom in wheels_of(model, robot).geoms:
-        model.geom_friction[geom, 0] = friction
+    for name in wheel_names(robot):
+        model.geom(f"{name}_wheel").friction[0] = friction
     data = mujoco.MjData(model)
     data.qpos[2] = robot.rest_z_m
     steps = round(1.0 / TIMESTEP_S)

@@ -6,7 +6,7 @@ are drawn as cylinders.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 
@@ -69,7 +69,7 @@ def add_robot(spec: Any, robot: RobotModel) -> None:
             **SOFT,
             **ROLLING_MASK,
         )
-    for name, (x, y) in zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True):
+    for name, (x, y) in zip(wheel_names(robot), robot.wheels_m.tolist(), strict=True):
         wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
         rolls_free = robot.steers and name.startswith("front")
         if rolls_free:
@@ -157,31 +157,11 @@ def _add_sensors(spec: Any) -> None:
     )
 
 
-class Wheels(NamedTuple):
-    """Indices of the wheels of a model: left before right, front before rear."""
-
-    bodies: list[int]
-    geoms: list[int]  # the spheres that touch the floor
-    joints: list[int]
-    steering: list[int]  # joints of steered front wheels, left and right
-
-
-def wheels_of(model: mujoco.MjModel, robot: RobotModel) -> Wheels:
-    """Return the wheels of a compiled model."""
-    names = [f"{name}_wheel" for name in _wheel_names(robot)]
-    sides = ("left", "right") if robot.steers else ()
-    return Wheels(
-        [model.body(name).id for name in names],
-        [model.geom(name).id for name in names],
-        [model.joint(f"{name}_joint").id for name in names],
-        [model.joint(f"front_{side}_steering").id for side in sides],
-    )
-
-
 def _caster_names(count: int) -> list[str]:
     return ["front", "back"] if count == 2 else [str(index) for index in range(count)]
 
 
-def _wheel_names(robot: RobotModel) -> list[str]:
+def wheel_names(robot: RobotModel) -> list[str]:
+    """Return the wheels' names: left before right, front before rear."""
     axles = ("front_", "rear_") if robot.wheelbase_m else ("",)
     return [axle + side for axle in axles for side in ("left", "right")]
