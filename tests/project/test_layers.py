@@ -71,7 +71,7 @@ MAY_IMPORT = {
     ),
     "train/study": "judge dqn evaluation run replay/panel twin/missions",
     "train/twin": "",
-    "train/twin/floors": "ingest/task",
+    "train/twin/floors": "",
     "train/twin/missions": "twin/floors",
     "train/twin/physics": "twin/floors twin/missions ingest/task",
     "train/twin/env": (
@@ -84,9 +84,7 @@ MAY_IMPORT = {
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
         " ingest/propose ingest/steps ingest/task"
     ),
-    "train/twin/calibration": (
-        "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
-    ),
+    "train/twin/calibration": ("twin/floors twin/physics replay/store ingest/profile ingest/task"),
     "report": (
         "look run fleet ingest/store replay replay/store train/evaluation train/judge train/run"
     ),
