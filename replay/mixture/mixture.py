@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from restock.errors import ConfigError
-from restock.renamed import MIXTURE_KEYS, MIXTURES
 from restock.replay.sampling.rules import RULES, Prioritised
 from restock.toml import Checked, parse_toml, read_toml, typed
 
@@ -276,8 +275,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     else:
         raise ConfigError(
             f"there is no mixture {name!r}",
-            remedy=MIXTURES.get(name)
-            or f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
+            remedy=f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
         )
     return parse_mixture(text, where=name)
 
@@ -288,13 +286,7 @@ def parse_mixture(text: str, *, where: str = "mixture") -> Mixture:
 
 
 def _mixture(document: dict[str, Any], where: str) -> Mixture:
-    return typed(
-        document,
-        Mixture,
-        where=where,
-        remedy="docs/mixture.md lists every key",
-        renamed=MIXTURE_KEYS,
-    )
+    return typed(document, Mixture, where=where, remedy="docs/mixture.md lists every key")
 
 
 def nanoseconds(moment: datetime) -> int:
