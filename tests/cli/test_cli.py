@@ -1,6 +1,7 @@
 """The command line: help, error messages and exit codes."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -19,6 +20,7 @@ def test_every_verb_has_help(command: str, shell: Shell) -> None:
     out = shell.out(*command.split(), "--help")
     assert f"restock {command}" in out
     assert len(out.split()) > 40
+    assert not re.search(r"^  --[\w-]+( \S+)?\n  -", out, re.M)  # an option without a text
 
 
 @pytest.mark.parametrize("command", COMMANDS)

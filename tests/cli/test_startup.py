@@ -29,7 +29,7 @@ def loaded(*args: str, codes: tuple[int, ...] = (0, 1)) -> set[str]:
 
 def test_help_imports_no_library() -> None:
     modules = loaded("--help")
-    used = SLOW | {"numpy", "pyarrow", "duckdb", "deltalake", "msgspec", "tyro", "rich"}
+    used = SLOW | {"numpy", "pyarrow", "duckdb", "deltalake", "msgspec", "rich"}
     assert modules & used == set()
     assert "importlib.metadata" not in modules
 
@@ -43,7 +43,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_query_imports_no_learning_or_readers(store: Path) -> None:
     modules = loaded("sql", str(store), "FROM coverage, transitions LIMIT 9", "--json")
-    assert modules & (SLOW | {"pyarrow.compute", "rich", "tyro"}) == set()
+    assert modules & (SLOW | {"pyarrow.compute", "rich"}) == set()
     assert "duckdb" in modules
 
 
@@ -60,7 +60,7 @@ def test_review_imports_no_learning_or_charts(store: Path, tmp_path: Path) -> No
 def test_ingest_imports_no_learning_or_pandas(tmp_path: Path) -> None:
     command = ("ingest", str(write_bag(Drive(), tmp_path / "bag")), "--store", str(tmp_path / "s"))
     assert loaded(*command, "--json") & (LEARNING | {"pandas", "pyarrow.dataset"}) == set()
-    assert loaded(*command) & {"asyncio", "duckdb", "pyarrow.compute", "tyro"} == set()
+    assert loaded(*command) & {"asyncio", "duckdb", "pyarrow.compute"} == set()
 
 
 @pytest.mark.parametrize(

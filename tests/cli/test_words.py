@@ -1,64 +1,58 @@
-"""Plain command lines are parsed without tyro, with the same result."""
+"""Command lines become the dataclasses of verbs, or errors that name the option."""
 
-import dataclasses
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hypothesis import event, given, settings
-from hypothesis import strategies as st
 
-from restock.cli import FOLDER_OF, command_of
-from restock.cli.command_line import parse
 from restock.cli.data.ingest import IngestCommand
 from restock.cli.data.sql import SqlCommand
+from restock.cli.fleet.coverage import GapsCommand
+from restock.cli.learning.diagnose import DiagnoseCommand
+from restock.cli.learning.train import TrainCommand
 from restock.cli.twin.layout import LayoutCommand
-from restock.cli.words import parse_plain
-
-COMMANDS = [command_of(name) for name in (*FOLDER_OF, "node", "mcp")]
-WORDS = ("a", "store/b", "7", "0.5", "-3", "None", "", "-", "--", "new", "cpu", "k=v", "1_0", " 2 ")
-
-
-@st.composite
-def lines(draw: st.DrawFn) -> tuple[type[Any], list[str]]:
-    """Draw a command and words: positional arguments, then options and values that may fit."""
-    command = draw(st.sampled_from(COMMANDS))
-    names = [field.name.replace("_", "-") for field in dataclasses.fields(command)]
-    option, word = st.sampled_from([f"--{name}" for name in names]), st.sampled_from(WORDS)
-    part = st.one_of(
-        option.map(lambda name: [name]),
-        st.tuples(option, word).map(list),
-        st.tuples(option, word).map(lambda both: ["=".join(both)]),
-        st.sampled_from(("--no-twin", "--jsn", *WORDS)).map(lambda one: [one]),
-    )
-    places = draw(st.lists(st.sampled_from(("a", "new")), max_size=2))
-    return command, [*places, *(one for words in draw(st.lists(part, max_size=3)) for one in words)]
-
-
-@settings(max_examples=200, deadline=None)
-@given(lines())
-def test_plain_lines_are_parsed_as_by_tyro(line: tuple[type[Any], list[str]]) -> None:
-    command, words = line
-    plain = parse_plain(command, words)
-    event("plain" if plain else "left to tyro")
-    assert plain is None or plain == parse(command, "restock", words)
+from restock.cli.words import parse
+from restock.errors import ConfigError
 
 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
         ("--export x.csv s", SqlCommand(path="s", export=Path("x.csv"))),
+        ("s - --json", SqlCommand(path="s", second="-", json=True)),
         ("a b --store=-s --json", IngestCommand(paths=("a", "b"), store="-s", json=True)),
+        ("a --store b c -- --d", IngestCommand(paths=("a", "c", "--d"), store="b")),
         ("--tag k=v --tag=l=w a", IngestCommand(paths=("a",), tag=("k=v", "l=w"))),
+        ("a --watch", IngestCommand(paths=("a",), watch=())),
+        ("", IngestCommand(paths=())),
         ("--from s --by map", LayoutCommand(source="s", by="map")),
+        ("s --min-rows -4 --thresholds none", GapsCommand("s", "coverage", Path("none"), -4)),
+        ("a --no-twin", DiagnoseCommand(places=(Path("a"),), twin=False)),
+        ("--set a=1 --seconds 1e3 --set b=2", TrainCommand(set=("a=1", "b=2"), seconds=1000.0)),
     ],
 )
-def test_plain_lines_need_no_tyro(words: str, expected: object) -> None:
-    assert parse_plain(type(expected), words.split()) == expected
+def test_line_is_parsed(words: str, expected: object) -> None:
+    assert parse(type(expected), "restock", words.split()) == expected
 
 
 @pytest.mark.parametrize(
-    "words", ["", "a --help", "a --jsn", "a --store", "a --workers x", "a -- b", "a --store b c"]
+    ("words", "message"),
+    [
+        ("a --jsn", "unknown: --jsn (did you mean --json?)"),
+        ("a --forc", "unknown: --forc (did you mean --force?)"),  # options are not abbreviated
+        ("a --twin=1", "unknown: --twin=1"),
+        ("a --store", "--store: expected one argument"),
+        ("a --store --json", "--store: expected one argument"),
+        ("a --workers x", "--workers: invalid int value: 'x'"),
+        ("a --repeated keeps", "--repeated: invalid choice: 'keeps' (choose from"),
+    ],
 )
-def test_other_lines_are_left_to_tyro(words: str) -> None:
-    assert parse_plain(IngestCommand, words.split()) is None
+def test_wrong_line_is_refused(words: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse(IngestCommand, "restock ingest", words.split())
+    assert message in refused.value.what
+    assert str(refused.value.remedy).startswith("`restock ingest --help`")
+
+
+def test_required_words_are_named() -> None:
+    with pytest.raises(ConfigError, match="required: PATH"):
+        parse(SqlCommand, "restock sql", [])

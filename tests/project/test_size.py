@@ -31,7 +31,7 @@ def count_options() -> int:
     """Count the options in the help of all verbs and their jobs, without `--help` itself."""
     jobs = [(verb, job) for verb, names in JOBS.items() for job in names]
     text = "\n".join(help_of(*words) for words in [*((verb,) for verb in VERBS), *jobs])
-    options = re.findall(r"^\W*(?:-\w, )?(--[\w-]+)", text, re.M)
+    options = re.findall(r"^  (?:-\w, )?(--[\w-]+)", text, re.M)
     return len(options) - options.count("--help")
 
 

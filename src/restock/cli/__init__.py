@@ -219,19 +219,12 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
     if FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
 
-    from restock.cli.words import parse_plain, refuse_empty_paths
+    from restock.cli.words import parse
 
-    command = command_of(name)
-    parsed = parse_plain(command, rest)
-    if parsed is None:
-        from restock.cli.command_line import parse
-
-        try:
-            parsed = parse(command, prog, rest)
-        except SystemExit as stop:  # tyro has printed help (0) or an error (2)
-            return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
-    if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in rest):
-        refuse_empty_paths(parsed)
+    try:
+        parsed = parse(command_of(name), prog, rest)
+    except SystemExit:  # the help was printed
+        return int(ExitCode.OK)
     with work_goes_on() if name in PRINTS_ON_THE_WAY else nullcontext():
         code: int | None = parsed.run()
     return int(code or ExitCode.OK)

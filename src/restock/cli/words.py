@@ -1,21 +1,24 @@
-"""Declare the options of verbs, and parse simple command lines without tyro.
-
-tyro takes a fifth of the time of a short command, so it is used only for help, for errors, and for
-lines that `parse_plain` does not handle.
-"""
+"""Declare the options of verbs, parse their command lines, and print their help."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import shutil
+import textwrap
 import types
 import typing
 from collections.abc import Collection, Sequence
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar
 
 from restock.errors import ConfigError
 
 C = TypeVar("C")
+MAX_WIDTH = 100  # columns; help is wrapped at this width or the terminal's
+_METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,76 +38,127 @@ class Repeated(Option):
     """An option that may be given several times."""
 
 
-def parse_plain(command: type[C], words: Sequence[str]) -> C | None:
-    """Parse a simple command line; return None if tyro has to parse it or to report an error.
+def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
+    """Parse a command line: the fields of the dataclass `command` are its options.
 
-    In a simple line, options are not abbreviated, values begin with a dash only after "=", and all
-    positional arguments are next to each other.
+    Raises:
+        ConfigError: the line has an unknown option, or a value that does not fit.
+        SystemExit: the help was asked for, and printed.
     """
+    help_asked = bool({"-h", "--help"} & set(words))
+    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    parser = _Parser(
+        prog=prog,
+        allow_abbrev=False,
+        formatter_class=partial(
+            argparse.RawDescriptionHelpFormatter, width=width, max_help_position=20
+        ),
+    )
     hints = typing.get_type_hints(command, include_extras=True)
-    fields: dict[str, tuple[Any, Option]] = {}
-    flags, options = dict[str, tuple[str, bool]](), dict[str, str]()
+    usage = [prog, "[OPTION]…"]
     for field in dataclasses.fields(command):  # type: ignore[arg-type]
-        kind, _, how = declared(hints[field.name])
-        fields[field.name] = kind, how
-        name = how.name or field.name.replace("_", "-")
-        if kind is bool:
-            flags[f"--no-{name}" if field.default else f"--{name}"] = field.name, not field.default
-        elif isinstance(how, Repeated) or not (isinstance(how, Positional) or _several(kind)):
-            options[f"--{name}"] = field.name
-    given, places = dict[str, list[str]](), list[int]()
-    values, rest = dict[str, Any](), iter(enumerate(words))
-    for at, word in rest:
-        option, equals, text = word.partition("=")
-        if word in flags:
-            name, values[name] = flags[word]
-        elif option in options:
-            name = options[option]
-            text = text if equals else next(rest, (at, "-"))[1]
-            if text.startswith("-") and not equals:
-                return None
-            given.setdefault(name, []).append(text)
-        elif word.startswith("-"):
-            return None
-        else:
-            places.append(at)
-    if places and places[-1] - places[0] != len(places) - 1:
-        return None
-    left = [words[at] for at in places]
-    for name, (kind, how) in fields.items():
-        if isinstance(how, Positional) and left:
-            count = len(left) if _several(kind) else 1
-            given[name], left = left[:count], left[count:]
-    try:
-        values |= {name: _value(*fields[name], texts) for name, texts in given.items()}
-        return None if left else command(**values)
-    except (TypeError, ValueError):  # a required argument is missing, or a value is invalid
-        return None
+        usage += _add(parser, field, hints[field.name])
+    if help_asked:
+        parser.usage = " ".join(usage)
+        _describe(parser, command, width)
+    values, unknown = parser.parse_known_intermixed_args(words)
+    if unknown:
+        parser.refuse(unknown[0])
+    given = {name: value for name, value in vars(values).items() if value is not None}
+    return command(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
-def declared(hint: Any) -> tuple[Any, bool, Option]:
-    """Return the type of a field, whether it may be None, and its declaration as an option."""
+class _Parser(argparse.ArgumentParser):
+    """A parser that raises its errors."""
+
+    def error(self, message: str) -> NoReturn:
+        remedy = f"`{self.prog} --help` explains its options"
+        raise ConfigError(message, where=self.prog, remedy=remedy)
+
+    def refuse(self, word: str) -> NoReturn:
+        """Refuse a word that fits no option, and suggest the nearest option."""
+        from difflib import get_close_matches
+
+        known = [name for name in self._option_string_actions if name.startswith("--")]
+        near = get_close_matches(word.partition("=")[0], known, n=1)
+        self.error(f"unknown: {word}" + (f" (did you mean {near[0]}?)" if near else ""))
+
+
+def _add(parser: _Parser, field: dataclasses.Field[Any], hint: Any) -> list[str]:
+    """Add a field to a parser; return how its usage shows it, if it is not a mere option.
+
+    Its default stays that of the dataclass: what is not given is None after parsing.
+    """
+    kind, how = _declared(hint)
+    needed = field.default is field.default_factory is dataclasses.MISSING
+    name = how.name or field.name.replace("_", "-")
+    if kind is bool:
+        flag = f"--no-{name}" if field.default else f"--{name}"
+        parser.add_argument(
+            flag, dest=field.name, action="store_const", const=not field.default, default=None
+        )
+        return []
+    several = typing.get_origin(kind) is tuple
+    item = typing.get_args(kind)[0] if several else kind
+    choices = typing.get_args(item) if typing.get_origin(item) is Literal else how.choices
+    metavar = how.metavar or (None if choices else _METAVARS.get(item, field.name.upper()))
+    settings: dict[str, Any] = {"metavar": metavar, "choices": choices or None}
+    settings["type"] = str if choices else _path if item is Path else item
+    if several and not isinstance(how, Repeated):
+        settings["nargs"] = "*"
+    shown = metavar or f"{{{','.join(choices)}}}"
+    if isinstance(how, Positional):
+        if not (several or needed):
+            settings["nargs"] = "?"
+        parser.add_argument(field.name, **settings)
+        shown += "…" * several
+        return [shown if needed else f"[{shown}]"]
+    action = "append" if isinstance(how, Repeated) else "store"
+    parser.add_argument(f"--{name}", dest=field.name, required=needed, action=action, **settings)
+    return [f"--{name} {shown}"] if needed else []
+
+
+def _path(text: str) -> Path:
+    """Convert a word to a path; refuse "", which Python would take for the working directory."""
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty: is a variable of the shell not set?")
+    return Path(text)
+
+
+def _declared(hint: Any) -> tuple[Any, Option]:
+    """Return the type of a field without None, and its declaration as an option."""
     annotated = typing.get_origin(hint) is typing.Annotated
     kind, *extras = typing.get_args(hint) if annotated else (hint,)
     how = next((one for one in extras if isinstance(one, Option)), Option())
-    if optional := typing.get_origin(kind) in (types.UnionType, typing.Union):
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
         (kind,) = set(typing.get_args(kind)) - {type(None)}
-    return kind, optional, how
+    return kind, how
 
 
-def _several(kind: Any) -> bool:
-    return typing.get_origin(kind) in (tuple, list)
+def _describe(parser: _Parser, command: type[Any], width: int) -> None:
+    """Give a parser the texts of its help: the docstrings of the dataclass and of its fields."""
+    import ast
+    import inspect
 
-
-def _value(kind: Any, how: Option, texts: Sequence[str]) -> Any:
-    """Convert words to the value of a field; raise ValueError for an invalid word or "None"."""
-    if _several(kind):
-        return typing.get_origin(kind)(_value(typing.get_args(kind)[0], how, [t]) for t in texts)
-    choices = typing.get_args(kind) if typing.get_origin(kind) is Literal else how.choices
-    (text,) = texts
-    if text == "None" or (choices and text not in choices):
-        raise ValueError
-    return text if choices else kind(text)
+    wrapper = textwrap.TextWrapper(width, break_on_hyphens=False, break_long_words=False)
+    parts = (inspect.getdoc(command) or "").split("\n\n")
+    parser.description = "\n\n".join(  # examples are indented, and stay as they are
+        part if part.startswith(" ") else wrapper.fill(part) for part in parts
+    )
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(command))).body
+    assert isinstance(tree, ast.ClassDef)
+    defaults = {field.name: field.default for field in dataclasses.fields(command)}
+    actions = {action.dest: action for action in parser._actions}
+    for field, below in pairwise(tree.body):
+        match field, below:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ):
+                default = defaults[name]
+                silent = not default or default in (True, dataclasses.MISSING)
+                known = "" if silent else f" (default: {default})"
+                actions[name].help = (" ".join(text.split()) + known).replace("%", "%%")
 
 
 def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
@@ -118,20 +172,4 @@ def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> No
             name = field.name.removesuffix("_dir").replace("_", "-")
             raise ConfigError(
                 why, where=f"--no-{name}" if field.default is True else f"--{name}", remedy=remedy
-            )
-
-
-def refuse_empty_paths(command: Any) -> None:
-    """Refuse empty paths, which Python would take for the working directory.
-
-    Raises:
-        ConfigError: a path is empty; `where` is the option or argument.
-    """
-    for field in dataclasses.fields(command):
-        value = getattr(command, field.name)
-        if Path() in (value if isinstance(value, list | tuple) else (value,)):
-            raise ConfigError(
-                "the path is empty: is a variable of the shell not set?",
-                where=field.name.replace("_", "-"),
-                remedy='give a path; "." is the working directory',
             )

@@ -55,9 +55,9 @@ class AuditCommand:
 
     store: Annotated[str, Positional("STORE")]
     """The store to audit. With --reward, it may also be a run."""
-    second: Annotated[Path | None, Positional("[PANEL|RUN]")] = None
+    second: Annotated[Path | None, Positional("PANEL|RUN")] = None
     """Also audit a panel that was made from the store, or the evaluation of a run."""
-    third: Annotated[Path | None, Positional("[RUN]")] = None
+    third: Annotated[Path | None, Positional("RUN")] = None
     """Also audit the other of panel and run; either may come first."""
     against: Annotated[str | None, Option("OLD")] = None
     """The earlier store, or an earlier version (store@41): everything it held must still be

@@ -32,7 +32,7 @@ class ExportCommand:
     """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, Option("OUT")]
     """The file or directory to write, which must not exist yet."""
-    panel: Annotated[Path | None, Positional("[PANEL]")] = None
+    panel: Annotated[Path | None, Positional("PANEL")] = None
     """Beside a store: a panel whose tables the query may use, as panel.rows and panel.strata."""
     query: Annotated[str | None, Option("SQL")] = None
     """An SQL query that selects transitions of a store, with all columns; for lerobot it may add

@@ -43,12 +43,12 @@ class SqlCommand:
 
     path: Annotated[str, Positional("PATH")]
     """A store, a run directory, a panel, a recording, or a folder of recordings."""
-    second: Annotated[str | None, Positional("[PANEL]")] = None
+    second: Annotated[str | None, Positional("PANEL")] = None
     """Beside a store: a panel or a run whose tables the query can also use, as panel.rows,
     run.audit, …"""
-    third: Annotated[str | None, Positional("[RUN]")] = None
+    third: Annotated[str | None, Positional("RUN")] = None
     """Beside a store: the other of panel and run; either may come first."""
-    query: Annotated[str | None, Positional("[QUERY]")] = None
+    query: Annotated[str | None, Positional("QUERY")] = None
     """The query, or - to read it from stdin. Default: open a prompt."""
     json: bool = False
     """Print a list of row objects."""

@@ -34,7 +34,7 @@ class ReviewCommand:
 
     store: Annotated[Path, Positional()]
     """The store's folder."""
-    file: Annotated[str | None, Positional("[FILE|none]", name="FILE|none")] = None
+    file: Annotated[str | None, Positional("FILE|none")] = None
     """Write the verdicts of this CSV file into the store; `none` removes all corrections."""
     out: Path | None = None
     """Write the events to this new file, review.csv, instead of serving a page."""

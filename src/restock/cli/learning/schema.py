@@ -34,7 +34,7 @@ class SchemaCommand:
     by the VS Code extension Even Better TOML).
     """
 
-    name: Annotated[str | None, Positional("[NAME]")] = None
+    name: Annotated[str | None, Positional("NAME")] = None
     """The name of the config."""
     json: bool = False
     """Print the list as JSON (a schema is always JSON)."""

@@ -34,7 +34,7 @@ class TraceCommand:
 
     place: Annotated[str, Positional("RUN|PANEL|STORE")]
     """The run, panel or store that holds the row."""
-    row: Annotated[str | None, Positional("[ROW]")] = None
+    row: Annotated[str | None, Positional("ROW")] = None
     """STEP/ROW of a run (for example 1200/17), a row number of a panel, or a transition id of a
     store."""
     recording: Annotated[Path | None, Option("PATH")] = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Thread
 from types import FrameType
@@ -48,7 +48,7 @@ class TrainCommand:
     """A panel from `restock mix`. Without one, training is online only."""
     config: Path | None = None
     """A TOML file with any of the config's keys (docs/train.md)."""
-    set: Annotated[list[str], Repeated()] = field(default_factory=list)
+    set: Annotated[tuple[str, ...], Repeated()] = ()
     """Set one key of the config, e.g. --set optimizer.learning_rate=1e-4. May be repeated."""
     resume: Path | None = None
     """Continue this run from its latest checkpoint."""

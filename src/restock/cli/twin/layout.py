@@ -30,7 +30,7 @@ class LayoutCommand:
         restock twin layout --from drive.mcap --out floor.toml --out floor.png
     """
 
-    floor: Annotated[str | None, Positional("[FLOOR]")] = None
+    floor: Annotated[str | None, Positional("FLOOR")] = None
     """The floor."""
     source: Annotated[str | None, Option("STORE|BAG", name="from")] = None
     """Make the floor from this recording or store."""
