@@ -35,10 +35,10 @@ class ValueRefused(ConfigError, ValueError):
 
 
 class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A struct that also checks ranges when it is made in Python, and converts NumPy's numbers.
+    """A struct that also checks its values when it is made in Python, and converts NumPy's numbers.
 
     Raises:
-        ValueRefused: a value is outside the range of its type, or `check` refuses it.
+        ValueRefused: a value does not fit its type or its range, or `check` refuses it.
     """
 
     def check(self) -> None:
@@ -46,14 +46,18 @@ class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         try:
-            for name, kind in _ranges(type(self)).items():
-                given = getattr(self, name)
+            for field in _fields(type(self)):
+                given = getattr(self, field.name)
                 if (value := _plain(given)) is not given:
-                    msgspec.structs.force_setattr(self, name, value)
-                _check(name, kind, value)
+                    msgspec.structs.force_setattr(self, field.name, value)
+                if value is not msgspec.UNSET:
+                    _check(field.name, field.type, value)
             self.check()
         except ValueError as error:
             raise ValueRefused(str(error)) from error
+
+
+_fields = functools.cache(msgspec.structs.fields)
 
 
 def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str, Any]:
@@ -138,27 +142,6 @@ def _key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
-@functools.cache
-def _ranges(kind: type) -> dict[str, kinds.Type]:
-    """Return name -> type of a struct's fields that are numbers, or contain numbers."""
-    info = kinds.type_info(kind)
-    assert isinstance(info, kinds.StructType)
-    return {f.name: f.type for f in info.fields if _ranged(f.type)}
-
-
-def _ranged(kind: kinds.Type) -> bool:
-    if isinstance(kind, kinds.UnionType):
-        return any(map(_ranged, kind.types))
-    if isinstance(kind, kinds.TupleType):
-        return any(map(_ranged, kind.item_types))
-    item = _item(kind)
-    return _is_number(kind) or (item is not None and _ranged(item))
-
-
-def _is_number(kind: kinds.Type) -> bool:
-    return bool(_bounds(kind)) or isinstance(kind, kinds.FloatType)
-
-
 def _item(kind: kinds.Type) -> kinds.Type | None:
     if isinstance(kind, kinds.DictType):
         return kind.value_type
@@ -181,36 +164,24 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _check(name: str, kind: kinds.Type, value: Any) -> None:
-    if value is None or value is msgspec.UNSET or isinstance(kind, kinds.StrType):
-        return
-    if isinstance(kind, kinds.UnionType):
-        fitting = [k for k in kind.types if _is_number(k) and isinstance(value, int | float)]
-        several = not isinstance(value, int | float | str)
-        lists = (k for k in kind.types if _item(k) or isinstance(k, kinds.TupleType))
-        fitting += [k for k in lists if several]
-        for option in fitting:
-            _check(name, option, value)
-        return
-    if isinstance(kind, kinds.TupleType):
-        if len(value) != len(kind.item_types):
-            raise ValueError(f"{name} must have {len(kind.item_types)} values, got {len(value)}")
-        for index, (one_kind, one) in enumerate(zip(kind.item_types, value, strict=True)):
-            _check(f"{name}[{index}]", one_kind, one)
-        return
-    item = _item(kind)
-    if item is not None:
-        items = value.items() if isinstance(value, Mapping) else enumerate(value)
-        for place, one in items:
-            _check(f"{name}.{place}" if isinstance(place, str) else f"{name}[{place}]", item, one)
-        return
-    if not isinstance(value, int | float):
-        raise ValueError(f"{name} must be a number, got {value!r}")
-    bounds = _bounds(kind)
-    if bounds and not _inside(value, bounds):
-        raise ValueError(f"{name} must be {_range_in_words(bounds)}, got {value}")
+def _check(name: str, kind: Any, value: Any) -> None:
+    """Raise ValueError if a value does not fit its type, or has a number that is not finite."""
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(_in_words(str(error), value, kind, name)) from error
+    _expect_finite(name, value)
+
+
+def _expect_finite(name: str, value: Any) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{name} must be finite, got {value}")
+    if isinstance(value, Mapping):
+        for key, one in value.items():
+            _expect_finite(f"{name}.{key}", one)
+    elif isinstance(value, list | tuple):
+        for index, one in enumerate(value):
+            _expect_finite(f"{name}[{index}]", one)
 
 
 def _bounds(kind: kinds.Type) -> dict[str, float]:
