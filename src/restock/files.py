@@ -140,25 +140,18 @@ _MARKS = {
 }
 
 
-def expect_file_place(path: Path | None, option: str, *, run: Path | None = None) -> None:
-    """Check, before any work, that an option's output file can be written and kept at `path`.
-
-    Args:
-        run: the run that the file describes; the file may be in its folder.
+def expect_file_place(path: Path | None, option: str) -> None:
+    """Check, before any work, that an option's output file is not a folder.
 
     Raises:
-        ConfigError: `path` is a folder, or is inside a panel, a store or another run.
+        ConfigError: `path` is a folder.
     """
-    if path is None:
-        return
-    if path.is_dir():
+    if path is not None and path.is_dir():
         raise ConfigError(
             f"{path} is a folder, and a file is to be written",
             where=option,
             remedy="give the name of a file, in this folder for example",
         )
-    if why := _within(path, run):
-        raise ConfigError(f"{path} {why}", where=option, remedy="choose another place")
 
 
 def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
@@ -177,18 +170,12 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} may not be written"
     elif any(map(is_undecoded, str(absolute))):
         why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
-    if why := _within(path) or why:
-        raise error(why, where=str(path), remedy="choose another --out")
-
-
-def _within(path: Path, run: Path | None = None) -> str | None:
-    """Return why `path` must not be used: it is inside a panel, store or other run; else None."""
-    for folder in path.absolute().parents:
+    for folder in absolute.parents:
         for mark, kind in _MARKS.items():
-            own = kind == "the run" and run is not None and run.resolve() == folder.resolve()
-            if (folder / mark).exists() and not own:
-                return f"is within {kind} {folder}: what replaces or removes that removes this, too"
-    return None
+            if (folder / mark).exists():
+                why = f"is within {kind} {folder}: what replaces or removes that removes this, too"
+    if why is not None:
+        raise error(why, where=str(path), remedy="choose another --out")
 
 
 def is_undecoded(letter: str) -> bool:

@@ -236,26 +236,6 @@ def test_report_verb_writes_page(run, tmp_path, shell):
     assert document == {"report": str(out), "bytes": out.stat().st_size}
 
 
-def test_no_verb_writes_into_store_or_other_run(run, store_path, tmp_path, shell):
-    own = tmp_path / "run"
-    shutil.copytree(run, own)
-    before = sorted([*store_path.rglob("*"), *run.rglob("*")])
-    store = str(store_path)
-    for words, place in (
-        (["report", str(own), "--out", str(run / "page.html")], f"the run {run}"),
-        (["coverage", store, "--out", str(store_path / "page.html")], f"the store {store}"),
-        (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
-        (["profile", "new", "a.mcap", "--out", f"{store}/p.toml"], f"the store {store}"),
-        (["review", store, "--out", f"{store}/l.csv"], f"the store {store}"),
-        (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
-        (["coverage", "gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
-        (["twin", "layout", "--out", f"{run}/floor.png"], f"the run {run}"),
-        (["twin", "fit", store, "--out", f"{store}/fitted.toml"], f"the store {store}"),
-    ):
-        assert f"is within {place}:" in " ".join(shell.err(*words).split())
-    assert sorted([*store_path.rglob("*"), *run.rglob("*")]) == before
-
-
 def test_missing_and_untrained_runs_are_refused(tmp_path: Path) -> None:
     Run.create(tmp_path / "run", {"config": {}})
     (tmp_path / "empty").mkdir()

@@ -10,7 +10,6 @@ import pytest
 import torch
 from support.kept_run import kept_run
 from support.shell import Shell
-from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -88,18 +87,6 @@ def test_eval_of_onnx_policy_matches_agent(run: Path, tmp_path: Path, shell: She
     }
     assert by["agent"] == by[f"run:{run}"]
     assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
-
-
-def test_export_into_store_or_other_run_is_rejected(run, tmp_path, shell):
-    store = write_store(tmp_path / "store", [recording_transitions(1)])
-    other = kept_run(tmp_path / "other")
-    for place, message in ((store, "the store"), (other, "the run")):
-        out = place / "p.onnx"
-        assert f"is within {message} {place}:" in " ".join(
-            shell.err("export", run, "--to", "onnx", "--out", out).split()
-        )
-        assert not out.exists()
-    assert main(["export", str(other), "--to", "onnx", "--out", str(other / "p.onnx")]) == 0
 
 
 def test_invalid_onnx_policy_is_rejected(run: Path, tmp_path: Path, shell: Shell) -> None:

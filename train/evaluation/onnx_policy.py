@@ -48,7 +48,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     run = Run.open(run_path)
     if out.exists():
         raise RunError("already exists", where=str(out), remedy="choose another --out")
-    expect_file_place(out, "--out", run=run.path)
+    expect_file_place(out, "--out")
     agent = load_agent(run)
     profile = profile_of_run(run)
     model = to_onnx(agent.network)

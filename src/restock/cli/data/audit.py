@@ -149,12 +149,11 @@ class AuditCommand:
             )
         if self.reward:
             _refuse_with(self, "--reward", "against", "baseline")
-        run = self._beside().get("run")
-        if self.baseline is not None and run is None:
+        if self.baseline is not None and "run" not in self._beside():
             raise ConfigError(
                 "applies only to a run", where="--baseline", remedy="give the run after the store"
             )
-        expect_file_place(self.junit, "--junit", run=run or Path(self.store))
+        expect_file_place(self.junit, "--junit")
 
     def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
         given = self._beside()

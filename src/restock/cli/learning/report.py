@@ -54,11 +54,10 @@ class ReportCommand:
             else:
                 sys.stdout.write(markdown)
             return None
-        expect_file_place(self.out, "--out", run=self.run_directory)
+        expect_file_place(self.out, "--out")
         with progress("report", None):
             if self.run_directory.is_dir() and kind_beside(self.run_directory) is None:
                 page = self.out or self.run_directory / "report.html"
-                expect_file_place(page, "--out")  # a page inside a store would be lost with it
                 path = write_page(history_page(self.run_directory), page)
             else:
                 path = build_report(self.run_directory, self.out)
