@@ -18,6 +18,7 @@ from restock.errors import counted, quoted, spreadsheet_safe, visible
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
+    from rich.text import Text
 
     from restock.replay.store.store import Store
 
@@ -225,7 +226,7 @@ def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
     """Return the width a column needs to show words, numbers and cells of `short` letters uncut."""
     from rich.cells import cell_len
 
-    texts = [cell(row[name]).replace(r"\[", "[") for row in rows]
+    texts = [cell(row[name]) for row in rows]
     full = max(cell_len(line) for text in [name, *texts] for line in text.split("\n"))
     uncut = texts if _numeric(rows, name) else " ".join(texts).split()
     return max([min(full, short), *map(cell_len, [*name.split(), *uncut])])
@@ -262,9 +263,10 @@ def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]
 
 
-def _styled(text: str) -> str:
-    style = _STYLES.get(text)
-    return f"[{style}]{text}[/]" if style else text
+def _styled(text: str) -> Text:
+    from rich.text import Text
+
+    return Text.styled(text, _STYLES.get(text, ""))
 
 
 def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
@@ -286,7 +288,7 @@ def print_plain(rows: Sequence[Row], columns: Sequence[str], *, values: bool = F
     With `values` (the rows of a query), NULL is printed, and columns are padded up to PIPE_WIDTH.
     """
     numeric = [_numeric(rows, name) for name in columns]
-    text = value_text if values else (lambda value: cell(value).replace(r"\[", "["))
+    text = value_text if values else cell
     texts = [[text(row[name]).replace("\n", r"\n") for name in columns] for row in rows]
     widths = [
         max([len(name), *(len(line[place]) for line in texts)])
@@ -356,7 +358,7 @@ def value_text(value: Any) -> str:
     if isinstance(value, Mapping):
         pairs = (f"{visible(str(name))}: {value_text(one)}" for name, one in value.items())
         return f"{{{', '.join(pairs)}}}"
-    return cell(value).replace(r"\[", "[")
+    return cell(value)
 
 
 def cell(value: Any) -> str:
@@ -372,7 +374,7 @@ def cell(value: Any) -> str:
         return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
     if isinstance(value, list | tuple):
         return ", ".join(map(cell, value)) if any(item is not None for item in value) else ""
-    return visible(str(value), keep="\n\t").replace("[", r"\[")
+    return visible(str(value), keep="\n\t")
 
 
 def is_number(value: Any) -> bool:
@@ -400,7 +402,7 @@ class Advance:
     def __call__(self, amount: float = 1.0, note: str = "") -> None:
         """Advance the bar by `amount`, and show `note`."""
         if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, advance=amount, note=cell(visible(note)))
+            self._bar.update(self._task, advance=amount, note=visible(note))
 
     def part(self, doing: str, done: float, whole: float) -> None:
         """Show the progress of the current part as a note, in percent."""
@@ -426,15 +428,15 @@ def progress(description: str, total: float | None) -> Iterator[Advance]:
     )
 
     bar = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         console=stderr(),
         transient=True,
         redirect_stdout=sys.stdout.isatty(),  # leave stdout alone if it is a file or a pipe
     )
     with bar:
-        yield Advance(bar, bar.add_task(cell(visible(description)), total=total, note=""))
+        yield Advance(bar, bar.add_task(visible(description), total=total, note=""))

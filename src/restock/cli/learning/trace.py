@@ -147,4 +147,4 @@ def _short(value: Any) -> str:
         return "; ".join(map(_short, value))
     if isinstance(value, list | tuple) and len(value) > _LONG:
         return f"{', '.join(_short(item) for item in value[:_LONG])}, … ({len(value)})"
-    return output.cell(value).replace(r"\[", "[")
+    return output.cell(value)
