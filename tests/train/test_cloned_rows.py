@@ -82,12 +82,11 @@ def test_run_reports_cloned_rows_and_updates(panel: Panel, tmp_path: Path) -> No
     alone = select_cloned(panel, TeacherConfig(policies=teacher.policies, successes=False))
     assert alone.sum() < rows.sum() < len(panel)
     others = int((rows & ~alone).sum())
-    assert f"{alone.sum():,} logged rows of operator, and {others:,} rows of" in describe_run(
-        prepared
-    )
+    drivers = f"({alone.sum():,} of operator, {others:,} of the successes of others)"
+    assert f"{rows.sum():,} logged rows are cloned first {drivers}" in describe_run(prepared)
     misspelt = [*logged, "teacher.policies=['operator', 'plannner']"]
     text = describe_run(prepare_new(tmp_path / "run", panel.path, None, misspelt))
-    assert "rows of operator (none of plannner: the panel has operator, planner)" in text
+    assert " of operator, 0 of plannner, " in text
     # The critic's 2,000 offline updates, scaled by rows / 5,000.
     assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
     fewer = prepare_new(

@@ -329,22 +329,14 @@ def _describe_teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     from restock.train.feed.teacher import select_cloned
     from restock.train.prepare import rows_by_policy
 
-    logged = {} if panel is None else rows_by_policy(panel)
-    there = [name for name in teacher.policies if logged.get(name)]
-    absent = [name for name in teacher.policies if name not in there]
-    rows = sum(logged[name] for name in there)
-    cloned_rows = f"{rows:,} logged rows of {', '.join(there or absent)}"
-    if there and absent:
-        cloned_rows += f" (none of {', '.join(absent)}: the panel has {', '.join(sorted(logged))})"
-    if panel is not None and teacher.successes:
-        others = int(select_cloned(panel, teacher).sum()) - rows
-        cloned_rows += (
-            f", and {others:,} rows of episodes in which other drivers alone reached the goal,"
-        )
-        rows += others
     first = "no logged rows to clone: all actions are plausible at first"
-    if rows:
-        first = f"{cloned_rows} are cloned first"
+    if panel is not None and (rows := int(select_cloned(panel, teacher).sum())):
+        logged = rows_by_policy(panel)
+        cloned = {name: logged[name] for name in teacher.policies}
+        if teacher.successes:
+            cloned["the successes of others"] = rows - sum(cloned.values())
+        drivers = ", ".join(f"{count:,} of {name}" for name, count in cloned.items())
+        first = f"{rows:,} logged rows are cloned first ({drivers})"
     mirrored = "; half of the teacher's rows are mirrored left to right" if teacher.mirror else ""
     return (
         f"teacher {teacher.source}: the policy chooses by Q among the actions that it finds"
