@@ -9,7 +9,6 @@ without a range: comparisons with `nan` are silently false, and JSON has neither
 from __future__ import annotations
 
 import functools
-import inspect
 import json
 import math
 import re
@@ -325,29 +324,3 @@ def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any)
     usual = type(settings)(**default)
     named = names or settings.__struct_fields__
     return [name for name in named if getattr(settings, name) != getattr(usual, name)]
-
-
-def json_schema(kind: type, title: str) -> str:
-    """Return the JSON Schema of a struct's TOML, for editors (`#:schema FILE` in the TOML).
-
-    It contains the types, ranges and defaults of the struct, but no rules about several keys.
-    Those are checked when the file is read.
-    """
-    schema = msgspec.json.schema(kind)
-    for definition in schema.get("$defs", {}).values():
-        definition["properties"] = {
-            key: _without_null(value) for key, value in definition.get("properties", {}).items()
-        }
-        if "description" in definition:  # a docstring, which keeps its indent before Python 3.13
-            definition["description"] = inspect.cleandoc(definition["description"])
-    draft = "https://json-schema.org/draft/2020-12/schema"
-    return json.dumps({"$schema": draft, "title": title, **schema}, indent=1) + "\n"
-
-
-def _without_null(value: dict[str, Any]) -> dict[str, Any]:
-    """Remove null from the type of a field: TOML has no null, and leaves the key out instead."""
-    choices = [choice for choice in value.get("anyOf", ()) if choice != {"type": "null"}]
-    if len(choices) == len(value.get("anyOf", ())):
-        return value
-    rest = {key: item for key, item in value.items() if key != "anyOf" and item is not None}
-    return {**choices[0], **rest} if len(choices) == 1 else {"anyOf": choices, **rest}

@@ -169,7 +169,7 @@ def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> No
     """
     for field in dataclasses.fields(command):
         if field.name in names and getattr(command, field.name) != field.default:
-            name = field.name.removesuffix("_dir").replace("_", "-")
+            name = field.name.replace("_", "-")
             raise ConfigError(
                 why, where=f"--no-{name}" if field.default is True else f"--{name}", remedy=remedy
             )

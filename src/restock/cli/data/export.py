@@ -111,7 +111,7 @@ class ExportCommand:
         """Return the names of cameras, as `export_dataset` takes them; None: all cameras."""
         if self.cameras == "all":
             return None
-        names = [name.strip() for name in self.cameras.split(",")]
+        names = output.names_in(self.cameras)
         return [] if names == ["none"] else names
 
 

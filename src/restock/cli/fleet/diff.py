@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 from restock.cli import output
@@ -47,7 +46,9 @@ class DiffCommand:
 
 
 def _difference(first: str, second: str) -> dict[str, Any]:
-    kinds = {place: _kind_of(place) for place in (first, second)}
+    from restock.replay.places import kind_beside
+
+    kinds = {place: kind_beside(place) or "store" for place in (first, second)}
     if len(set(kinds.values())) > 1:
         raise RestockError(
             f"{first} is a {kinds[first]}, {second} a {kinds[second]}",
@@ -71,18 +72,9 @@ def _difference(first: str, second: str) -> dict[str, Any]:
         return diff_stores(one, other)
 
 
-def _kind_of(place: str) -> str:
-    """Recognise a panel by its header and a run by its config; anything else counts as a store."""
-    from restock.replay.panel.panel import HEADER
-    from restock.replay.places import RUN_CONFIG
-
-    if "://" in place:
-        return "store"
-    if (Path(place) / HEADER).is_file():
-        return "panel"
-    return "run" if (Path(place) / RUN_CONFIG).is_file() else "store"
-
-
+# Columns of a document's rows -> their titles.
+_DEFINITIONS = {"what": "what", "a": "a", "b": "b"}
+_KEYS = {"key": "key", "a": "a", "b": "b"}
 _RECORDINGS = {
     **{"change": "change", "source_file": "recording", "episodes": "episodes", "rows": "rows"},
     "rows_relabelled": "relabelled",
@@ -101,20 +93,12 @@ def show(document: dict[str, Any]) -> None:
 
 def _print_stores(document: dict[str, Any]) -> None:
     a, b = document["a"], document["b"]
-    names = [f"a: {a['path']} version {a['version']}", f"b: {b['path']} version {b['version']}"]
-    output.print_table(
-        [
-            {"": what, names[0]: a[what], names[1]: b[what]}
-            for what in ("recordings", "episodes", "rows", "hours")
-        ]
-    )
+    heads = (f"a: {a['path']} version {a['version']}", f"b: {b['path']} version {b['version']}")
+    _print_sides(document, heads, ("recordings", "episodes", "rows", "hours"))
     if not document["different"]:
         output.print_text("no difference in recordings, episodes, labels or definitions")
         return
-    section(
-        "definitions that differ",
-        _select_columns(document["definitions"], _untitled("what", "a", "b")),
-    )
+    section("definitions that differ", _select_columns(document["definitions"], _DEFINITIONS))
     section("recordings", _select_columns(document["recordings"], _RECORDINGS))
     episodes = document["episodes"]
     output.print_text(
@@ -131,12 +115,13 @@ def _print_stores(document: dict[str, Any]) -> None:
 
 
 def _print_panels(document: dict[str, Any]) -> None:
-    _print_sides(document, ("id", "store", "store_version", "rows", "effective_rows", "logs_share"))
+    names = ("id", "store", "store_version", "rows", "effective_rows", "logs_share")
+    _print_sides(document, [f"{side}: {document[side]['path']}" for side in "ab"], names)
     if not document["different"]:
         output.print_text("the same panel: mixture, rows and weights")
         return
-    _print_keys("header", document["header"])
-    _print_keys("mixture", document["mixture"])
+    for part in ("header", "mixture"):
+        section(f"{part}: keys that differ", _select_columns(document[part], _KEYS))
     rows, weights = document["rows"], document["weights"]
     output.print_text(
         f"rows: {rows['in']:,} in, {rows['out']:,} out, {rows['both']:,} in both;"
@@ -148,23 +133,9 @@ def _print_panels(document: dict[str, Any]) -> None:
     section("strata: % of rows, wanted, drawn, after weights", strata)
 
 
-def _print_sides(document: dict[str, Any], names: tuple[str, ...]) -> None:
-    heads = [f"{side}: {document[side]['path']}" for side in "ab"]
-    output.print_table(
-        [
-            {"": name, heads[0]: document["a"][name], heads[1]: document["b"][name]}
-            for name in names
-        ],
-        ["", *dict.fromkeys(heads)],
-    )
-
-
-def _print_keys(title: str, rows: list[dict[str, Any]]) -> None:
-    section(f"{title}: keys that differ", _select_columns(rows, _untitled("key", "a", "b")))
-
-
-def _untitled(*names: str) -> dict[str, str]:
-    return {name: name for name in names}
+def _print_sides(document: dict[str, Any], heads: Sequence[str], names: Sequence[str]) -> None:
+    a, b = document["a"], document["b"]
+    output.print_table([{"": name, heads[0]: a[name], heads[1]: b[name]} for name in names])
 
 
 def _select_columns(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[dict[str, Any]]:

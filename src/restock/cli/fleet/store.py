@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from restock.cli import output
@@ -225,9 +224,9 @@ class VerifyCommand:
     def run(self) -> ExitCode:
         """Verify all files, and list the damaged ones."""
         from restock.ingest.store.damaged_files import verify_store
-        from restock.replay.panel.panel import HEADER
+        from restock.replay.places import kind_beside
 
-        if (Path(self.store) / HEADER).is_file():
+        if kind_beside(self.store) == "panel":
             return self._verify_panel()
         done = verify_store(self.store)
         if self.json:

@@ -54,15 +54,14 @@ class DiagnoseCommand:
     """Print the verdict, the evidence and every window as JSON."""
 
     def run(self) -> int:
+        from restock.replay.places import kind_beside
         from restock.train.judge.diagnose import check_place, confirm, diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
         if not self.places:
             raise ConfigError("needs a run, a panel or a store", where="restock diagnose")
         first, *others = self.places
-        if not (first / "config.json").is_file() and not any(
-            (one / "config.json").is_file() for one in others
-        ):
+        if not any(kind_beside(one) == "run" for one in self.places):
             return self._before_training(first, ",".join(map(str, others)))
         refuse(
             self,

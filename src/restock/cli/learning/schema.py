@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
+
+import msgspec
 
 from restock.cli import output
 from restock.cli.words import Positional
@@ -54,13 +57,18 @@ class SchemaCommand:
 
 
 def schema_of(name: str) -> str:
-    """Return the schema of a config, as JSON text."""
-    from restock.toml import json_schema
+    """Return the JSON Schema of a config, as text (`#:schema FILE` in the TOML).
 
-    schema = json.loads(json_schema(_kinds()[name], f"Restock {name}"))
+    It contains the types, ranges and defaults of the struct, but no rules about several keys.
+    Those are checked when the file is read.
+    """
+    schema = msgspec.json.schema(_kinds()[name])
+    for definition in schema["$defs"].values():  # docstrings keep their indent before Python 3.13
+        definition["description"] = inspect.cleandoc(definition.get("description", ""))
     if name == "profile":
         _conditions_in_files(schema)
-    return json.dumps(schema, indent=1) + "\n"
+    draft = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps({"$schema": draft, "title": f"Restock {name}", **schema}, indent=1) + "\n"
 
 
 def _kinds() -> dict[str, type]:

@@ -84,7 +84,7 @@ class FitCommand:
         from restock.train.twin.calibration.fit_solver import DEFAULT
 
         name = "fitted" if self.out is None else self.out.stem
-        names = [name.strip() for name in (self.parameters or "").split(",")]
+        names = output.names_in(self.parameters or "")
         config = FitConfig(
             parameters=DEFAULT if self.parameters is None else tuple(dict.fromkeys(names)),
             recordings=recordings,
