@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock import __version__
-from restock.errors import ArgumentError, PanelError, RestockError, StoreError, expect
+from restock.errors import PanelError, RestockError, StoreError
 from restock.files import building, expect_place, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.task.conditions import (
@@ -192,15 +192,15 @@ def open_source(
 def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table, where: str) -> dict[str, int]:
     """Register a table as `given`; a table of any task is converted to the columns of a store.
 
-    Returns reason -> number of rows left out. Raises ArgumentError or StoreError if columns are
-    missing or have other types.
+    Returns reason -> number of rows left out. Raises StoreError if columns are missing or have
+    other types.
     """
     remedy = "give rows with the columns of Store(…).sql('FROM transitions')"
     try:
         connection.register("given", given)
     except duckdb.InvalidInputException as error:
         what = f"transitions must be a Store or a table, got {repr(given)[:80]}"
-        raise ArgumentError(what, remedy=remedy) from error
+        raise StoreError(what, remedy=remedy) from error
     kinds = {name.casefold(): kind for name, kind in _kinds(connection.table("given")).items()}
     needed: tuple[str, ...] = _NEEDED
     if "episode_id" not in kinds:
@@ -301,15 +301,8 @@ def build_panel(
 
     Raises:
         ConfigError, MixtureError, StoreError: see `plan_panel`.
-        ArgumentError: an argument of a wrong type.
         PanelError: `out` already exists.
     """
-    expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
-    if isinstance(transitions, duckdb.DuckDBPyRelation):
-        raise ArgumentError(
-            f"transitions must be a Store or a table, got {repr(transitions)[:80]}",
-            remedy="take its `.to_arrow_table()`",
-        )
     check_free(Path(out), force)
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
         return write_panel(source, source.plan(mixture), out, force=force, advance=advance)

@@ -26,7 +26,7 @@ from typing import Any, Literal, cast
 
 import duckdb
 
-from restock.errors import ConfigError, StoreError, expect
+from restock.errors import ConfigError, StoreError
 from restock.files import first_line
 from restock.process import interrupts_raised
 from restock.replay.store.definitions import install_named, is_empty, rows_held
@@ -258,7 +258,6 @@ def check_thresholds(
     """
     used, shipped = {audit.name: audit.parameters for audit in audits}, load_thresholds()
     for name, table in thresholds.items():
-        expect(f"thresholds[{name!r}]", table, Mapping, "give its thresholds by their names")
         if name not in used:
             likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
             if others and not likely:
@@ -361,10 +360,9 @@ def recommend_capacity(
     `effective_episodes`. A smaller first-in-first-out buffer forgets whole cells, which no sampling
     brings back, or has rows of a few drives only.
 
-    Raises StoreError if there are no transitions, ConfigError for a share outside [0, 1], negative
-    effective_episodes, or a path in place of a connection.
+    Raises StoreError if there are no transitions, ConfigError for a share outside [0, 1] or
+    negative effective_episodes.
     """
-    expect("connection", connection, duckdb.DuckDBPyConnection, 'give Store("store").connection')
     if not 0 <= cells_share <= 1 or not effective_episodes >= 0:
         raise ConfigError(
             f"cells_share must be in [0, 1], and effective_episodes at least 0, got {cells_share} "

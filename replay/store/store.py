@@ -14,7 +14,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -23,7 +22,7 @@ import duckdb
 import msgspec
 import pyarrow as pa
 
-from restock.errors import QueryError, StoreError, expect
+from restock.errors import QueryError, StoreError
 from restock.ingest.store.damaged_files import damaged_error, unverified_files, verify_files
 from restock.ingest.store.lineage import (
     Ingest,
@@ -97,7 +96,6 @@ class Store:
     Raises:
         StoreError: there is nothing at the path, it is not a store, it has no such version, or it
             cannot be reached.
-        ArgumentError: the version is neither a number nor a time.
     """
 
     @interrupts_raised
@@ -110,8 +108,6 @@ class Store:
     ) -> None:
         self.path = Location.of(path)
         version = self.path.version if version is None else version
-        if version is not None:
-            expect("version", version, (int, datetime), "give a number, or a moment")
         _expect_store(self.path)
         transitions = self.path.open_table(TRANSITIONS, version)
         recordings = self.path.open_table(RECORDINGS)

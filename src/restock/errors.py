@@ -89,25 +89,8 @@ class RestockError(Exception):
         super().__init__("\n  ".join(parts))
 
 
-def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str) -> None:
-    """Check the type of an argument: callers may pass a path where an opened object is needed.
-
-    Raises:
-        ArgumentError: the argument is not of type `kind`.
-    """
-    if not isinstance(given, kind):
-        kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
-        article = "an" if kinds[0].lower() in "aeiou" else "a"
-        what = f"{name} must be {article} {kinds}, got {repr(given)[:80]}"
-        raise ArgumentError(what, remedy=remedy)
-
-
 class ConfigError(RestockError):
     """A profile, mixture or other TOML file with a setting that Restock cannot use."""
-
-
-class ArgumentError(ConfigError, TypeError):
-    """An argument of a Python function that has the wrong type."""
 
 
 class RecordingError(RestockError):
@@ -183,24 +166,19 @@ def quoted(path: object) -> str:
 def policy_words(policies: Iterable[str]) -> dict[str, str]:
     """Return display names of policies, keyed by the names that `--policies` takes.
 
-    `run:demo/logs-alone` is shown as `logs alone`. If two folders or files have the same name,
-    their parent folders are shown as well.
+    `run:demo/logs-alone` is shown as `logs alone`. Names stay as they are if two folders or files
+    have the same name.
     """
-    names = list(dict.fromkeys(policies))
-    most = max((len(PurePath(name).parts) for name in names), default=0)
-    for parts in range(1, most + 1):
-        shown = {name: _policy_in_words(name, parts) for name in names}
-        if len(set(shown.values())) == len(names):
-            return shown
-    return {name: name for name in names}
+    shown = {name: _policy_in_words(name) for name in policies}
+    return shown if len({*shown.values()}) == len(shown) else {name: name for name in shown}
 
 
-def _policy_in_words(name: str, parts: int) -> str:
-    """Shorten a policy's name to the last `parts` parts of its path."""
+def _policy_in_words(name: str) -> str:
+    """Shorten a policy's name to the name of its folder or file."""
     kind, _, path = name.partition(":")
     if kind == "limited":
-        return f"{_policy_in_words(path, parts)}, limited"
+        return f"{_policy_in_words(path)}, limited"
     if kind not in ("run", "onnx") or not PurePath(path).name:
         return name
-    text = "/".join(PurePath(path).parts[-parts:]).replace("-", " ").replace("_", " ")
+    text = PurePath(path).name.replace("-", " ").replace("_", " ")
     return f"{kind}:{text}" if text in _POLICIES else text
