@@ -6,27 +6,23 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from restock import cli
 from restock.cli.start import demo, outcomes
 from restock.cli.start.demo import DemoCommand, plan_of
 from restock.cli.start.stages import Settings, Stage
 from restock.cli.start.work import Work
-from restock.train.run.run import FORMAT
 
 SILENT = lambda message: None  # noqa: E731
 
 
 def plan(tmp_path: Path) -> list[Stage]:
-    return plan_of(Settings((str(tmp_path / "logs"),), tmp_path / "out", seconds=5, episodes=1))
+    return plan_of(Settings((str(tmp_path / "logs"),), tmp_path / "out", episodes=1))
 
 
 def test_every_stage_is_valid_command(tmp_path: Path) -> None:
     verbs = [stage.command[0] for stage in plan(tmp_path)]
     before = ["info", "ingest", "sql", "audit", "mix", "mix"]
-    assert verbs == [*before, "train", "train", "train", "eval", "eval", "report"]
+    assert verbs == [*before, "train", "train", "eval", "eval", "report"]
     assert {stage.name for stage in plan(tmp_path)} <= demo.WHY.keys()
     for stage in plan(tmp_path):
         assert cli.main([*stage.command, "--help"]) == 0
@@ -35,7 +31,7 @@ def test_every_stage_is_valid_command(tmp_path: Path) -> None:
 
 def test_compared_trainings_differ_only_in_panel(tmp_path: Path) -> None:
     settings = ("practice.rule=success", "seed=3")
-    to = Settings(("logs",), tmp_path, seconds=9, train=settings)
+    to = Settings(("logs",), tmp_path, train=settings)
     (stage,) = [stage for stage in plan_of(to) if stage.beside]
     options = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
     first, second = (
@@ -45,27 +41,6 @@ def test_compared_trainings_differ_only_in_panel(tmp_path: Path) -> None:
     differing = {flag for flag in first if first[flag] != second[flag]}
     assert differing == {"--panel", "--out"}
     assert {"practice.rule=success", "seed=3"} <= {*stage.command} & {*stage.beside}
-
-
-def test_run_that_is_behind_catches_up(tmp_path: Path) -> None:
-    to = Settings(("logs",), tmp_path, seconds=9)
-    other = demo.fed_uniformly(to)
-
-    def driven(run: int, uniform: int) -> list[str] | None:
-        for path, steps in ((to.run, run), (other, uniform)):
-            path.mkdir(exist_ok=True)
-            (path / "config.json").write_text(json.dumps({"format": FORMAT}))
-            table = pa.table({"env_steps": [0, steps]})
-            pq.write_table(table, path / "progress.parquet")
-        return demo.catch_up(to)
-
-    assert driven(500, 500) is None
-    behind = driven(480, 500)
-    assert behind is not None
-    assert behind[:5] == ["train", "--resume", str(to.run), "--env-steps", "500"]
-    ahead = driven(512, 500)
-    assert ahead is not None
-    assert ahead[:5] == ["train", "--resume", str(other), "--env-steps", "512"]
 
 
 def verb(command: list[str], code: int = 0) -> int:
@@ -102,23 +77,6 @@ def test_unexpected_exit_code_stops_demo(tmp_path, monkeypatch):
     # A failed audit is expected on sample logs; a mixture that is refused is not.
     assert DemoCommand(out=tmp_path / "out").run() == 2
     assert ran[-1] == "mix"
-
-
-def test_stage_command_is_decided_when_stage_begins(tmp_path: Path) -> None:
-    ran: list[list[str]] = []
-
-    def dispatch(command: list[str]) -> int:
-        ran.append(command)
-        return verb(command)
-
-    def stage(command: list[str] | None) -> Stage:
-        return Stage("x", "x", ["train", "LATER"], decided=lambda: command)
-
-    assert Work(tmp_path / "out", dispatch, SILENT).do(stage(["train", "now"])).good
-    assert ran == [["train", "now", "--json"]]
-    assert Work(tmp_path / "out", dispatch, SILENT).do(stage(["train", "then"])).status == "kept"
-    assert Work(tmp_path / "none", dispatch, SILENT).do(stage(None)).good
-    assert len(ran) == 1
 
 
 def test_demo_refuses_foreign_folder(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ Each stage prints its purpose, and its command as a user could type it.
 
 from __future__ import annotations
 
-import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -41,9 +40,9 @@ class DemoCommand:
     out: Path = Path("restock-demo")
     """The folder for store, panel, run and report. Stages that an earlier call finished there are
     kept."""
-    seconds: float = 200.0
-    """Training time in seconds. Two policies train at the same time: one fed by quotas, one fed
-    uniformly."""
+    env_steps: int = 48_000
+    """Steps in the twin of each training. Two policies train at the same time: one fed by quotas,
+    one fed uniformly."""
     episodes: int = 20
     """Evaluation episodes per kind of episode, policy and perturbation."""
     dry_run: bool = False
@@ -54,17 +53,16 @@ class DemoCommand:
     def run(self) -> int:
         from restock.cli import main
 
-        if not 0 < self.seconds < math.inf:
-            raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
-        if self.episodes < 1:
-            raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
+        for name in ("env_steps", "episodes"):
+            if (given := getattr(self, name)) < 1:
+                option = f"--{name.replace('_', '-')}"
+                raise ConfigError(f"must be at least 1, got {given}", where=option)
         found = find_logs()
         to = Settings(
             (str(found or self.out / "logs"),),
             self.out,
-            seconds=self.seconds,
             episodes=self.episodes,
-            train=("practice.rule=success",),
+            train=("practice.rule=success", f"schedule.env_steps={self.env_steps}"),
         )
         plan = plan_of(to)
         if found is None:
@@ -126,22 +124,16 @@ def plan_of(to: Settings) -> list[Stage]:
         Stage(
             "logs-alone",
             "Before fine-tuning: a policy from the logs alone",
-            replace(to, train=settings).training(to.panel, alone, timed=False),
+            replace(to, train=settings).training(to.panel, alone),
             writes=(alone,),
         ),
         replace(
             stages.train(to),
             title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
+            command=to.training(to.panel, to.run),
             beside=tuple(to.training(uniform_panel, uniform)),
             writes=(to.run, uniform),
             resume=(),  # not resumed: one of the two trainings may have ended
-        ),
-        Stage(
-            "even-out",
-            "As many steps for both",
-            ["train", "--resume", str(uniform), "--env-steps", "AS_THE_OTHER"],
-            shows_progress=True,
-            decided=lambda: catch_up(to),
         ),
         stages.evaluate(to, f"run:{uniform}", f"run:{alone}"),
         Stage(
@@ -169,39 +161,17 @@ WHY = {
     "mix-uniform": "Every row has the same probability; strata are only used for the statistics.",
     "logs-alone": "Updates on the panel, by Q among the actions that its good drivers would"
     " plausibly take; nothing is driven in the twin.",
-    "train": "Two trainings at once, with the same settings and seed. In the first, each condition"
-    " gets its quota of every batch, from logs and fresh rows; in the other, logs and fresh rows"
-    " are drawn uniformly. Both practise the missions that go wrong more often. The policy chooses"
-    " by Q among actions that the twin's operator finds plausible. Every row is recorded.",
-    "even-out": "The one that has driven less continues until both have made the same number of"
-    " steps.",
+    "train": "Two trainings at once, with the same settings, seed and number of steps. In the"
+    " first, each condition gets its quota of every batch, from logs and fresh rows; in the other,"
+    " logs and fresh rows are drawn uniformly. Both practise the missions that go wrong more often."
+    " The policy chooses by Q among actions that the twin's operator finds plausible. Every row is"
+    " recorded.",
     "eval": "The kept checkpoint, the policy fed uniformly, the one from the logs alone, the"
     " scripted planner and a random policy, clean and with less friction and more latency than in"
     " training.",
     "film": "Episodes of the evaluation, driven again: failing before on the left, and after.",
     "report": "What the policy was fed, what it learned, and where it fails.",
 }
-
-
-def catch_up(to: Settings) -> list[str] | None:
-    """Return the command that continues the shorter of the two runs; None if they are equally long.
-
-    The comparison of their feeds needs the same number of steps.
-    """
-    steps = {path: steps_of(path) for path in (to.run, fed_uniformly(to))}
-    behind, ahead = sorted(steps, key=lambda path: steps[path])
-    if steps[behind] == steps[ahead]:
-        return None
-    longest_s = f"{10 * to.seconds + 600:g}"  # long enough that the number of steps ends training
-    budget = ("--env-steps", str(steps[ahead]), "--seconds", longest_s)
-    return ["train", "--resume", str(behind), *budget]
-
-
-def steps_of(run: Path) -> int:
-    """Return how many steps a run made in the twin."""
-    from restock.train.run.run import Run
-
-    return max(Run.open(run).table("progress")["env_steps"].to_pylist(), default=0)
 
 
 def print_results(to: Settings, evaluated: Document, console: Console) -> None:
@@ -217,12 +187,8 @@ def print_results(to: Settings, evaluated: Document, console: Console) -> None:
                 console.print(line, markup=False, soft_wrap=True)
         sys.stdout.flush()
 
-    steps = steps_of(to.run)
     what = "Missions that reached their goal without a contact, with 95 % intervals."
-    driven = f"The agent is the fine-tuned policy: {steps:,} steps in the twin here."
-    if not steps:
-        driven = "The time was up before anything was driven: give more --seconds."
-    show("Before and after fine-tuning", [what, driven, *SAMPLE_OF_ONE])
+    show("Before and after fine-tuning", [what, *SAMPLE_OF_ONE])
     print_table(before_and_after(evaluated))
     fed = fed_shares(Run.open(to.run))
     what = "Shares of all rows, in % (`FROM fed` of the run)."
@@ -245,8 +211,8 @@ restock diagnose {run}
     why a critic fails: because of what it was fed, or of its target?"""
 
 SAMPLE_OF_ONE = (
-    "Fed uniformly has the same network, settings, seed and steps; every row of the logs has the"
-    " same probability.",
+    "The agent is the fine-tuned policy. Fed uniformly has the same network, settings, seed and"
+    " steps; every row of the logs has the same probability.",
     "One seed each is a sample of one: docs/evidence.md has ten, and what 128,000 steps gave.",
 )
 UPDATES = 2000  # of the run on logs alone: as many as other runs make before driving

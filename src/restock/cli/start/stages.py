@@ -30,8 +30,6 @@ class Stage:
     shows_progress: bool = False  # for a stage that takes minutes
     resume: tuple[str, ...] = ()  # the command that continues an interrupted stage
     beside: tuple[str, ...] = ()  # a command that runs in parallel
-    # The command if it depends on earlier stages; None: there is nothing to do.
-    decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
         """Return the command as a user types it; first the parallel command, if there is one."""
@@ -100,12 +98,10 @@ class Settings:
         place = choose_definitions(self.definitions).partition("+")[2]
         return (*map(Path, self.logs), *([Path(place)] if place else []))
 
-    def training(self, panel: Path, run: Path, *, timed: bool = True) -> list[str]:
-        """Return the command that trains a run."""
+    def training(self, panel: Path, run: Path, *budget: str) -> list[str]:
+        """Return the command that trains a run, with the options of its budget."""
         settings = (word for setting in self.train for word in ("--set", setting))
-        seconds = ["--seconds", f"{self.seconds:g}"] if timed else []
-        place = ("--panel", str(panel), "--out", str(run))
-        return ["train", *place, *seconds, *settings]
+        return ["train", "--panel", str(panel), "--out", str(run), *budget, *settings]
 
 
 def own_file(name: Path | str | None) -> tuple[Path, ...]:
@@ -229,10 +225,11 @@ def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
 def train(to: Settings, *, twin: bool = True) -> Stage:
     """Train offline and then in the twin, or on the logs alone."""
     online = "Train: first on the panel, then online in the twin"
+    budget = ("--seconds", f"{to.seconds:g}") if twin else ()
     return Stage(
         "train",
         online if twin else "Train on the logs alone, without a twin",
-        to.training(to.panel, to.run, timed=twin),
+        to.training(to.panel, to.run, *budget),
         writes=(to.run,),
         outcome=outcomes.train,
         shows_progress=True,

@@ -111,12 +111,6 @@ class Work:
         if (kept := self._earlier_result(stage, stamp)) is not None:
             self.say(f"[cyan]$ {escape(stage.line())}[/cyan]  [dim]done before[/dim]")
             return self._add_result(kept)
-        if stage.decided is not None:
-            if (command := stage.decided()) is None:
-                return self._add_result(
-                    StageResult(stage.name, "", "kept", outcome=["nothing to do"])
-                )
-            stage = replace(stage, command=command)
         began = self._records.get(stage.name, {})
         saved = any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
         if stage.resume and began.get("stamp") == stamp and saved:
