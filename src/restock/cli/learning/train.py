@@ -266,7 +266,10 @@ def describe_run(prepared: Prepared) -> str:
             f"evaluation.off_policy has no effect: {has} ([evaluation_split] of a mixture)"
         )
     if config.env.twin:
-        lines += _describe_not_evaluated(document)
+        lines += [
+            f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}"
+            for name, signals in document.get("not_evaluated", {}).items()
+        ]
         lines += report_unreachable(open_floors(config.env.layouts))
     return "\n".join(lines)
 
@@ -342,18 +345,3 @@ def _describe_teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
         f"teacher {teacher.source}: the policy chooses by Q among the actions that it finds"
         f" plausible; {first}{mirrored}"
     )
-
-
-def _describe_not_evaluated(document: dict[str, Any]) -> list[str]:
-    """Return a sentence for each condition that the twin cannot show, with the reason."""
-    from restock.ingest.task.task import LIDAR_SIGNALS
-
-    return [
-        f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}: "
-        + (
-            "no log contains it"
-            if LIDAR_SIGNALS.issuperset(signals)
-            else "its stratum consists of logs alone"
-        )
-        for name, signals in document.get("not_evaluated", {}).items()
-    ]
