@@ -108,7 +108,7 @@ MAY_IMPORT = {
     "cli/learning": (
         "cli report ingest/profile replay replay/fleet replay/mixture replay/trace"
         " train train/judge train/dqn train/evaluation train/run"
-        " train/study train/twin/floors train/twin/physics ingest/task"
+        " train/study train/twin/floors train/twin/physics"
         " replay/panel train/feed"
     ),
     "cli/start": (
