@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from restock.errors import ConfigError
 from restock.files import write_text
+from restock.renamed import MISSIONS_KEYS
 from restock.toml import Checked, read_toml, toml_value, typed
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def read_missions(path: str | Path) -> MissionsFile:
     """
     remedy = "`restock coverage gaps STORE --missions-out FILE` writes one"
     document = read_toml(Path(path), remedy=remedy)
-    return typed(document, MissionsFile, where=str(path), remedy=_REMEDY)
+    return typed(document, MissionsFile, where=str(path), remedy=_REMEDY, renamed=MISSIONS_KEYS)
 
 
 def from_shopping_list(found: ShoppingList, *, store: str, mixture: str) -> MissionsFile:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.renamed import MIXTURE_KEYS, MIXTURES
 from restock.replay.sampling.rules import RULES, Prioritised
 from restock.toml import Checked, parse_toml, read_toml, typed
 
@@ -275,7 +276,8 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     else:
         raise ConfigError(
             f"there is no mixture {name!r}",
-            remedy=f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
+            remedy=MIXTURES.get(name)
+            or f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
         )
     return parse_mixture(text, where=name)
 
@@ -286,7 +288,13 @@ def parse_mixture(text: str, *, where: str = "mixture") -> Mixture:
 
 
 def _mixture(document: dict[str, Any], where: str) -> Mixture:
-    return typed(document, Mixture, where=where, remedy="docs/mixture.md lists every key")
+    return typed(
+        document,
+        Mixture,
+        where=where,
+        remedy="docs/mixture.md lists every key",
+        renamed=MIXTURE_KEYS,
+    )
 
 
 def nanoseconds(moment: datetime) -> int:

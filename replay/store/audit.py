@@ -29,6 +29,7 @@ import duckdb
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
 from restock.process import interrupts_raised
+from restock.renamed import AUDITS
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import found, interruptible, rows_of
@@ -260,9 +261,9 @@ def check_thresholds(
     for name, table in thresholds.items():
         if name not in used:
             likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
-            if others and not likely:
+            if others and not likely and name not in AUDITS:
                 continue
-            remedy = _suggest(likely, f"the audits are {', '.join(used)}")
+            remedy = _suggest(name, likely, f"the audits are {', '.join(used)}")
             raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
         if unknown := sorted(table.keys() - used[name]):
             names = ", ".join(sorted(used[name])) or "none"
@@ -270,13 +271,15 @@ def check_thresholds(
             raise ConfigError(
                 f"{name}.{unknown[0]} is not a threshold of this audit",
                 where="thresholds",
-                remedy=_suggest(likely, f"its thresholds are {names}"),
+                remedy=_suggest(unknown[0], likely, f"its thresholds are {names}"),
             )
         for key, value in table.items():
             _check_value(f"{name}.{key}", value, shipped.get(name, {}).get(key), "thresholds")
 
 
-def _suggest(likely: Sequence[str], known: str) -> str:
+def _suggest(name: str, likely: Sequence[str], known: str) -> str:
+    if name in AUDITS:
+        return AUDITS[name]
     return f"did you mean {likely[0]!r}?" if likely else known
 
 

@@ -105,16 +105,21 @@ def typed(
     *,
     where: str,
     remedy: str | None = None,
+    renamed: Mapping[str, str] | None = None,
     prefix: str = "",
 ) -> T:
     """Convert plain values to a typed struct.
 
     Args:
+        renamed: dotted keys of earlier versions -> what to write instead (see restock.renamed).
         prefix: dotted path that precedes each key in errors.
 
     Raises:
-        ConfigError: a key is unknown or missing, or a value does not fit its type.
+        ConfigError: a key is unknown, missing or renamed, or a value does not fit its type.
     """
+    for old, instead in (renamed or {}).items():
+        if _has(document, old.split(".")):
+            raise ConfigError(f"unknown key `{_join(prefix, old)}`", where=where, remedy=instead)
     try:
         return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
@@ -296,6 +301,16 @@ def _places(
         )
         if item is not None:
             yield from _places(item, one, rest, _join(key, str(name)))
+
+
+def _has(document: Any, keys: list[str]) -> bool:
+    """Return whether a document has a value at a path of keys; in arrays, any item may have it."""
+    if not keys:
+        return True
+    if isinstance(document, list):
+        return any(_has(one, keys) for one in document)
+    key, *rest = keys
+    return isinstance(document, Mapping) and key in document and _has(document[key], rest)
 
 
 def _join(*parts: str) -> str:

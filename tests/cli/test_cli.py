@@ -11,6 +11,8 @@ from support.shell import Shell
 
 from restock import cli, native
 from restock.errors import ExitCode
+from restock.renamed import OPTIONS
+from restock.renamed import VERBS as RENAMED
 
 COMMANDS = [*cli.VERBS, *(f"{verb} {job}" for verb in cli.JOBS for job in cli.JOBS[verb])]
 
@@ -29,6 +31,22 @@ def test_every_verb_is_documented(command: str) -> None:
     assert f"restock {command}" in pages
 
 
+@pytest.mark.parametrize("verb", RENAMED)
+def test_renamed_verb_suggests_new_name(verb, shell):
+    err = shell.err(verb, "store")
+    assert RENAMED[verb] in err
+    named = re.findall(r"`restock (\w+)(?: (\w+))?", err)
+    assert all(new in cli.VERBS and verb != new for new, _ in named)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_removed_option_suggests_replacement(option, shell):
+    command = option.rpartition(" ")[0] or "sql"
+    assert OPTIONS[option] in shell.err(
+        *command.split(), "place", f"--{option.partition('--')[2]}=1"
+    )
+
+
 @pytest.mark.parametrize("words", [["store"], ["store", "none"], ["twin", "none"]], ids=" ".join)
 def test_missing_job_lists_jobs(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == ExitCode.USAGE
@@ -36,14 +54,11 @@ def test_missing_job_lists_jobs(words: list[str], capsys: pytest.CaptureFixture[
     assert all(job in printed for job in cli.JOBS[words[0]])
 
 
-@pytest.mark.parametrize(
-    ("verb", "meant"), [("inget", "restock ingest"), ("gaps", "restock coverage gaps")]
-)
-def test_unknown_verb_suggests_nearest(verb: str, meant: str, shell: Shell) -> None:
-    out, err = shell.printed(verb, code=2)
+def test_unknown_verb_suggests_nearest(shell: Shell) -> None:
+    out, err = shell.printed("inget", code=2)
     assert out == ""
-    assert f"no verb named {verb!r}" in err
-    assert f"`{meant}`" in err
+    assert "no verb named 'inget'" in err
+    assert "restock ingest" in err
 
 
 def test_version_is_printed() -> None:

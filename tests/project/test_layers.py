@@ -18,7 +18,7 @@ MAX_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
 SHARED = {
     *("arrays", "errors", "files", "native", "process", "public"),
-    *("state", "stats", "toml"),
+    *("renamed", "state", "stats", "toml"),
 }
 MAY_IMPORT = {
     "ingest": "containers profile steps store task",

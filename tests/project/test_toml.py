@@ -178,6 +178,20 @@ def test_settings_with_choices_list_them(kind: type) -> None:
         assert set(re.findall(r'"(.+?)"', listed)) == names, refused.value.what
 
 
+def test_renamed_key_is_refused_with_new_name() -> None:
+    renamed = {"portion": "use share", "inner.portion": "use inner.share"}
+    for values, old, new in (
+        ({"portion": 0.1}, "portion", "share"),
+        ({"inner": {"portion": 0.1}}, "inner.portion", "inner.share"),
+        ({"inner": [{}, {"portion": 0.1}]}, "inner.portion", "inner.share"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            typed(values, Config, where="config.toml", renamed=renamed)
+        assert refused.value.what == f"unknown key `{old}`"
+        assert refused.value.remedy == f"use {new}"
+    assert typed({"share": 0.1}, Config, where="config.toml", renamed=renamed).share == 0.1
+
+
 @given(st.floats(allow_nan=False), st.integers(-3, 3))
 def test_python_accepts_what_a_file_accepts(share: float, count: int) -> None:
     def made(how: Any) -> Config | None:

@@ -247,6 +247,8 @@ def test_custom_audits_and_thresholds(tmp_path, clean):
         for audit, given, place in (
             ("slow", {}, "slow"),  # no threshold least
             ("slow", {"slow": {"least": 1, "most": 2}}, r"slow\.most"),
+            ("slow", {"flattering_policy": {}}, "'policy_bias'"),  # its new name
+            ("slow", {"slow": {"max_flattery": 1}}, "'max_bias'"),
             ("slow", {"sloow": {"least": 1}}, "'sloow'"),
             ("broken", {}, "broken"),
         ):

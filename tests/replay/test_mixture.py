@@ -40,6 +40,7 @@ from restock.replay.plan.weights import importance_weights
         (EVERY + "[sources]\nlogs = 0.0", "sources.logs must be above 0"),
         (EVERY + "[adaptive]\nfloor = 0.7", "unknown key `adaptive`"),
         ('[[strata]]\nname = "nominal"\nmin_rows = 9', "unknown key"),
+        ('[[sources.stores]]\nname = "a"\npath = "b"\nversion = 1', "as in STORE@12"),
         (
             "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",
             "share of 'a' is 0.1, below its floor",

@@ -93,6 +93,15 @@ def test_failed_start_leaves_no_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
+def test_renamed_key_is_rejected_with_remedy(tmp_path: Path) -> None:
+    old = tmp_path / "old.toml"
+    old.write_text("[network]\nensemble = 3\n")
+    for path, overrides in ((old, []), (None, ["network.ensemble=3"])):
+        with pytest.raises(ConfigError, match=r"unknown key `network\.ensemble`") as refused:
+            load_config(path, overrides)
+        assert "--to run" in str(refused.value)
+
+
 def test_default_shares_match_gymnasium_environment() -> None:
     trained: Any = make_twin(TrainConfig(), load_profile("warehouse_amr"), 2)
     made: Any = gymnasium.make_vec("restock/Warehouse-v0", num_envs=2)

@@ -17,6 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.renamed import TRAINING_KEYS
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.twin.env.interface import LinearEpsilon
@@ -295,11 +296,11 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """Parse a typed config from plain values.
 
     Raises:
-        ConfigError: an unknown key, or a value out of range; names the key.
+        ConfigError: an unknown or renamed key, or a value out of range; names the key.
     """
     _refuse_other_rule(document.get("target"), where)
     remedy = "docs/train.md lists every key with its meaning"
-    return typed(document, TrainConfig, where=where, remedy=remedy)
+    return typed(document, TrainConfig, where=where, remedy=remedy, renamed=TRAINING_KEYS)
 
 
 def _refuse_other_rule(target: Any, where: str) -> None:

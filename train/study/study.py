@@ -12,6 +12,7 @@ import msgspec
 
 from restock.errors import ConfigError, RunError
 from restock.files import read_json
+from restock.renamed import STUDY_KEYS
 from restock.toml import Checked, read_toml, typed
 from restock.train.dqn.config import (
     EvaluationConfig,
@@ -170,7 +171,7 @@ def load_study(path: Path | str) -> Study:
     """
     remedy = "docs/compare.md lists every key with its meaning"
     document = read_toml(Path(path))
-    study = typed(document, Study, where=str(path), remedy=remedy)
+    study = typed(document, Study, where=str(path), remedy=remedy, renamed=STUDY_KEYS)
     _refuse_unknown_names(study.evaluation, str(path))
     for arm in study.arms:
         sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]

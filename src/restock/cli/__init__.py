@@ -196,8 +196,11 @@ def _named(args: list[str]) -> tuple[str, str, list[str]]:
 def _refuse_verb(verb: str) -> NoReturn:
     from difflib import get_close_matches
 
-    jobs = [f"{parent} {verb}" for parent, names in JOBS.items() if verb in names]
-    near = jobs or get_close_matches(verb, VERBS, n=1)
+    from restock.renamed import VERBS as RENAMED
+
+    if verb in RENAMED:
+        raise RestockError(f"there is no verb {verb!r} any more", remedy=RENAMED[verb])
+    near = get_close_matches(verb, VERBS, n=1)
     hint = f"did you mean `restock {near[0]}`?" if near else "see `restock --help`"
     raise RestockError(f"no verb named {verb!r}", remedy=hint)
 
@@ -215,6 +218,7 @@ def _say_jobs(verb: str, rest: list[str]) -> int:
 
 def _run(name: str, prog: str, rest: list[str]) -> int:
     """Parse the arguments of a command, and run it."""
+    _refuse_removed_options(name, prog, rest)
     when_imported("pyarrow", _settle_pandas)
     if FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
@@ -228,6 +232,17 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
     with work_goes_on() if name in PRINTS_ON_THE_WAY else nullcontext():
         code: int | None = parsed.run()
     return int(code or ExitCode.OK)
+
+
+def _refuse_removed_options(name: str, prog: str, rest: list[str]) -> None:
+    options = [word.partition("=")[0] for word in rest if word.startswith("--")]
+    if not options:
+        return
+    from restock.renamed import OPTIONS
+
+    for option in options:
+        if instead := OPTIONS.get(f"{name} {option}") or OPTIONS.get(option):
+            raise RestockError(f"there is no option {option} any more", where=prog, remedy=instead)
 
 
 def command_of(name: str) -> type[Any]:
