@@ -33,8 +33,8 @@ from restock.ingest.store.version import (
     Version,
     expect_format,
     expect_readable,
+    expect_readable_commits,
     expect_whole,
-    log_damage,
     split_version,
     unsupported,
     version_at,
@@ -240,13 +240,15 @@ class Location:
         except (TableNotFoundError, DeltaError, ValueError) as error:
             if refused := unsupported(error, name, where=self.text):
                 raise refused from error
-            if self.folder and (known := log_damage(self.folder / name / LOG, where=self.text)):
-                raise known from error
+            if self.folder is not None:
+                expect_readable_commits(self.folder / name / LOG, where=self.text)
             raise StoreError(
                 f"its table `{name}` cannot be opened"
                 + (f" at version {version}" if version is not None else "")
                 + f": {first_line(error)}",
                 where=self.text,
+                remedy=f"restore its {LOG} from a copy; a checkpoint that cannot be read may be"
+                " deleted, together with _last_checkpoint, if all commits are there",
             ) from error
 
     def has_new_commits(self, name: str, table: DeltaTable) -> bool:

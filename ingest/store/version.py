@@ -16,23 +16,20 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
-from restock.files import first_line
 
 Version = int | datetime
 # Description in each table's metadata. Raise the number if columns, meanings or summaries change.
 FORMAT = "restock-store/2"
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
 LOG = "_delta_log"  # folder of a table's log
-_LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
 _SHORT = 1024  # bytes; only smaller commits are checked: cut after commitInfo, one has 1/3 of it
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
@@ -87,55 +84,43 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
     return max(before)
 
 
-def expect_whole(log: Path, version: int, *, where: str) -> None:
+def expect_whole(log: Path, version: int, *, where: str, least_bytes: int = _SHORT) -> None:
     """Check that all commits that a version is read from are complete.
 
-    Delta's library silently accepts an empty or truncated commit: rows would be missing.
+    Delta's library silently accepts an empty or truncated commit: rows would be missing. Commits of
+    `least_bytes` and more are not read.
 
     Raises:
-        StoreError: a commit is empty or truncated.
+        StoreError: a commit is empty, truncated or otherwise damaged.
     """
     for number in range(version, -1, -1):
         file = log / f"{number:020}.json"
         try:
             if (log / f"{number:020}.checkpoint.parquet").exists():
                 return
-            short = file.stat().st_size < _SHORT
-            problem = _problem_of_commit(file) if short else None
+            problem = _problem_of_commit(file) if file.stat().st_size < least_bytes else None
         except FileNotFoundError:  # deleted, as a checkpoint of another format has it
             return
         if problem:
-            raise _damaged(file, problem, where, newest=version)
+            raise StoreError(
+                f"its file {log.parent.name}/{LOG}/{file.name} {problem}",
+                where=where,
+                remedy="restore it from a copy, or delete it, as it is the last commit: the store"
+                " is then as it was before; then run the command that made it again"
+                if number == version
+                else "restore it from a copy; if there is none, ingest the recordings into a new"
+                " store",
+            )
 
 
-def log_damage(log: Path, *, where: str) -> StoreError | None:
-    """Return an error for the newest file of a log that is missing or unreadable, or None."""
-    try:
-        found = [match for one in log.iterdir() if (match := _LOGGED.fullmatch(one.name))]
-        hinted = _hinted_checkpoint(log)
-    except OSError:
-        return None
-    there = {match[0] for match in found}
-    numbers = sorted({int(match[1]) for match in found}, reverse=True)
-    for place, number in enumerate(numbers):
-        commit, checkpoint = (f"{number:020}.{kind}" for kind in ("json", "checkpoint.parquet"))
-        if commit in there and (problem := _problem_of_commit(log / commit)):
-            return _damaged(log / commit, problem, where, newest=numbers[0])
-        if checkpoint in there or number == hinted:
-            if problem := _problem_of_checkpoint(log / checkpoint):
-                needless = all(f"{one:020}.json" in there for one in range(number + 1))
-                return _damaged(log / checkpoint, problem, where, needless=needless)
-        elif (numbers[place + 1] if place + 1 < len(numbers) else -1) != number - 1:
-            return _damaged(log / f"{number - 1:020}.json", "is missing", where)
-    return None
+def expect_readable_commits(log: Path, *, where: str) -> None:
+    """Name the newest damaged commit of a log that Delta's library could not read.
 
-
-def _hinted_checkpoint(log: Path) -> int | None:
-    """Return the version of the checkpoint that `_last_checkpoint` names, or None."""
-    try:
-        return int(json.loads((log / "_last_checkpoint").read_bytes())["version"])
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
-        return None
+    Raises:
+        StoreError: a commit is damaged.
+    """
+    newest = max((int(one.stem) for one in log.glob("*.json") if one.stem.isdigit()), default=-1)
+    expect_whole(log, newest, where=where, least_bytes=sys.maxsize)
 
 
 def _problem_of_commit(file: Path) -> str | None:
@@ -154,40 +139,6 @@ def _problem_of_commit(file: Path) -> str | None:
         if ours or info.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
             return "is truncated: it does not list its changes"
     return None
-
-
-def _problem_of_checkpoint(file: Path) -> str | None:
-    try:
-        for _ in pq.ParquetFile(file).iter_batches():
-            pass
-    except FileNotFoundError:
-        return "is missing"
-    except (OSError, pa.ArrowException) as error:
-        return f"cannot be read: {first_line(error)}"
-    return None
-
-
-def _damaged(
-    file: Path, problem: str, where: str, *, newest: int | None = None, needless: bool = False
-) -> StoreError:
-    """Return the error for a damaged file of a log whose last commit has the number `newest`.
-
-    A checkpoint is `needless` if all commits up to it exist.
-    """
-    remedy = "if there is none, ingest the recordings into a new store"
-    if newest is not None and file.stem == f"{newest:020}":
-        remedy = (
-            "or delete it, as it is the last commit: the store is then as it was before; then "
-            "run the command that made it again"
-        )
-    elif needless:
-        remedy = "or delete it and _last_checkpoint beside it: the commits contain the same"
-    table = file.parent.parent.name
-    return StoreError(
-        f"its file {table}/{LOG}/{file.name} {problem}",
-        where=where,
-        remedy=f"restore it from a copy{'; ' if remedy.startswith('if ') else ', '}{remedy}",
-    )
 
 
 # Features that Restock supports: they concern a column type, checkpoints and vacuum, not row files.
