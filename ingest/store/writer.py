@@ -464,8 +464,11 @@ def fold(
             store.path, RECORDINGS, plan.chosen, plain, schema, extra=extra, summarised=True
         )
         paths = {file.path for file in plan.chosen}
-        if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
-            break
+        try:
+            if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
+                break
+        finally:
+            store.discard_uncommitted(RECORDINGS, [one])
     else:
         raise StoreError(
             f"other writers were faster {ATTEMPTS} times",
@@ -613,7 +616,10 @@ def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted
     schema = pa.schema(store.path.open_table(TRANSITIONS).schema().to_arrow())
     made = merge(store.path, TRANSITIONS, group, list(held.values()), schema, summarised=True)
     paths = {file.path for file in group}
-    version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
+    try:
+        version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
+    finally:
+        store.discard_uncommitted(TRANSITIONS, [made])
     if version is None:
         done.changed_meanwhile += len(group)
         return
