@@ -16,7 +16,7 @@ import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -63,6 +63,14 @@ class AddedFile:
     size: int = 0  # bytes, once it is written
 
 
+class Committed(NamedTuple):
+    """A commit to a table."""
+
+    version: int  # of the table
+    before: int  # the last version without the commit
+    replaced: list[str]  # the `own_path` of each ingest whose rows were removed
+
+
 def add_action(file: AddedFile, now_ms: int) -> AddAction:
     """Return the Delta action that adds a file."""
     stats = json.dumps({"numRecords": file.rows})
@@ -77,14 +85,6 @@ def parquet_options(schema: pa.Schema) -> dict[str, Any]:
         "use_dictionary": [f.name for f in schema if pa.types.is_string(f.type)],
         "use_byte_stream_split": _float_columns(schema),
     }
-
-
-def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
-    """Write a new file with only the `kept` ingests of a joined file of transitions."""
-    path = f"{TRANSITIONS}/{file.path}"
-    with damage_named(place, path):
-        schema = place.read_schema(path)
-    return merge(place, TRANSITIONS, [file], kept, schema)
 
 
 def merge(
@@ -263,23 +263,37 @@ class TableCommits(StoreReader):
             expect_writable(self.path.open_table(name), where=str(self.path), removing=True)
 
     def commit(
-        self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]
-    ) -> tuple[int, list[str]]:
+        self,
+        name: str,
+        added: Sequence[AddedFile],
+        instead_of: Mapping[str, str],
+        operation: str = "restock ingest",
+    ) -> Committed:
         """Add files in one commit, which in `transitions` also removes their recordings' old rows.
 
-        `instead_of` maps recordings to ingests that must still be the newest in the store. Returns
-        the table's version, and the `own_path` of each ingest that was removed.
+        Without `added`, the rows of the recordings in `instead_of` are removed. `instead_of` maps
+        recordings to ingests that must still be the newest in the store.
+
+        Raises:
+            StoreError: a recording was ingested again or removed in the meantime, or other writers
+                were faster too many times.
         """
-        recordings = sorted({file.recording_id for file in added})
+        recordings = sorted({file.recording_id for file in added} or instead_of)
+        before: list[int] = []
         replaced: list[str] = []
         rewritten: list[AddedFile] = []
 
         def attempt() -> int:
             listing = self._listing(name)
             table, active = listing.table, listing.files
-            if {file.path for file in added} <= {file.path for file in active}:
+            if (
+                {file.path for file in added} <= {file.path for file in active}
+                if added
+                else before and not _own_paths(active, recordings)
+            ):
                 return table.version()  # an earlier attempt was committed, but its answer was lost
             self._expect_unchanged(instead_of)
+            before[:] = [table.version()]
             now_ms = time.time_ns() // 1_000_000
             actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
             locks = []
@@ -291,43 +305,12 @@ class TableCommits(StoreReader):
                 # Two concurrent first ingests of one recording remove nothing: only the transaction
                 # id, which both use, makes Delta report a conflict.
                 locks = _make_locks(table, recordings)
-            self.transact(table, actions, locks)
+            self.transact(table, actions, locks, operation)
             return self._read_own_commit(name, table)
 
         with self.discarded_on_failure(name, rewritten):
-            return self.retry_on_conflict(attempt), replaced
-
-    def remove_rows(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
-        """Remove recordings from `transitions`, all or none; `ingests` maps recording to ingest.
-
-        The caller removes their manifests.
-
-        Returns the last version of the table that has them, and the new version without them.
-
-        Raises:
-            StoreError: a recording was ingested again or removed in the meantime, or other writers
-                were faster too many times.
-        """
-        rewritten: list[AddedFile] = []
-        before: list[int] = []
-
-        def attempt() -> int:
-            listing = self._listing(TRANSITIONS)
-            table, active = listing.table, listing.files
-            self.discard_uncommitted(TRANSITIONS, rewritten)  # files of an earlier attempt
-            rewritten.clear()
-            if before and not _own_paths(active, ingests):
-                return table.version()  # an earlier attempt was committed, but its answer was lost
-            self._expect_unchanged(ingests)
-            before[:] = [table.version()]
-            now_ms = time.time_ns() // 1_000_000
-            actions = self._removing_actions(active, ingests, rewritten, now_ms)
-            self.transact(table, actions, _make_locks(table, sorted(ingests)), operation)
-            return self._read_own_commit(TRANSITIONS, table)
-
-        with self.discarded_on_failure(TRANSITIONS, rewritten):
             version = self.retry_on_conflict(attempt)
-        return before[0], version
+        return Committed(version, before[0] if before else version, replaced)
 
     def _removing_actions(
         self,
@@ -347,7 +330,10 @@ class TableCommits(StoreReader):
                 continue
             actions.append(RemoveAction(file.path, True, now_ms))
             if kept:
-                rewritten.append(rewrite(self.path, file, kept))
+                path = f"{TRANSITIONS}/{file.path}"
+                with damage_named(self.path, path):
+                    schema = self.path.read_schema(path)
+                rewritten.append(merge(self.path, TRANSITIONS, [file], kept, schema))
                 actions.append(add_action(rewritten[-1], now_ms))
         return actions
 

@@ -153,7 +153,7 @@ class StoreWriter(TableCommits):
     ) -> int:
         """Write several recordings, as (manifest row, transitions), in one commit.
 
-        `instead_of` maps each recording to the ingest that its new rows were made from: if another
+        `instead_of` maps recordings to the ingest that their new rows were made from: if another
         writer has replaced one of these ingests since, nothing is written.
 
         Raises:
@@ -162,13 +162,14 @@ class StoreWriter(TableCommits):
         staged: list[Staged] = []
         try:
             for manifest, rows in recordings:
-                staged.append(self.stage(manifest, rows))
+                made_from = (instead_of or {}).get(manifest["recording_id"][0].as_py())
+                staged.append(self.stage(manifest, rows, instead_of=made_from))
                 self.fit(staged[-1:])
         except BaseException:  # no commit has begun, so no table needs the files
             self.discard(staged)
             raise
         try:
-            return self._commit_files(staged, instead_of or {})
+            return self.commit_staged(staged)
         except BaseException:
             self.take_back(staged)
             raise
@@ -214,18 +215,14 @@ class StoreWriter(TableCommits):
                 times, or the tables cannot be written. Call `take_back` if you will not try again.
         """
         pa.default_memory_pool().release_unused()
-        read = {one.recording_id: one.instead_of for one in staged if one.instead_of}
-        version = self._commit_files(staged, read)
+        instead_of = {one.recording_id: one.instead_of for one in staged if one.instead_of}
+        self._commit_manifests(staged, instead_of)
+        done = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
+        with suppress(StoreError):  # the rows are committed; `clean` removes manifests without rows
+            self.remove(RECORDINGS, done.replaced)
         for one in staged:
             self.remember(one.recording_id, one.ingest_id, one.contents)
-        return version
-
-    def _commit_files(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> int:
-        self._commit_manifests(staged, instead_of)
-        version, replaced = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
-        with suppress(StoreError):  # the rows are committed; `clean` removes manifests without rows
-            self.remove(RECORDINGS, replaced)
-        return version
+        return done.version
 
     def _commit_manifests(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> None:
         """Write and commit the manifests that are not in `recordings` yet.
@@ -243,7 +240,8 @@ class StoreWriter(TableCommits):
             for one in new if not made else ():
                 made.append(AddedFile(one.recording_id, one.rows.path, len(one.manifest)))
                 made[-1].size = self._write(one.manifest, f"{RECORDINGS}/{one.rows.path}")
-            self.commit(RECORDINGS, made, instead_of)
+            if made:
+                self.commit(RECORDINGS, made, instead_of)
 
     def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
         """Remove recordings from the store in one commit; `ingests` maps recording to ingest.
@@ -256,9 +254,9 @@ class StoreWriter(TableCommits):
             StoreError: a recording was ingested again or removed in the meantime, or other writers
                 were faster too many times. The store is unchanged.
         """
-        versions = self.remove_rows(ingests, operation)
+        done = self.commit(TRANSITIONS, [], ingests, operation)
         self.remove(RECORDINGS, {own_path(*ids) for ids in ingests.items()})
-        return versions
+        return done.before, done.version
 
     def fit(self, staged: Sequence[Staged]) -> None:
         """Ensure that the tables exist and have the columns of these recordings.
