@@ -7,21 +7,17 @@ them until the retention window is over.
 from __future__ import annotations
 
 import os.path
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import Any
 
-from restock.errors import StoreError, counted, quoted
+from restock.errors import StoreError, quoted
 from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock store remove"
-ID_DIGITS = 16
 PREFIX_DIGITS = 6  # least number of an id's first digits that can name a recording
 _MAX_NAMED = 5
-_HEX = re.compile(rf"[0-9a-f]{{1,{ID_DIGITS}}}")
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,11 @@ def _choose(
         if len(found) == 1:
             chosen[found[0]["recording_id"]] = found[0]
         else:
-            problems.append(_explain(live, name, found))
+            problems.append(
+                f"{name!r} is the name of {len(found)} recordings: {_listed(found)}"
+                if found
+                else f"no recording {name!r} is in the store"
+            )
     if problems:
         raise StoreError(
             "\n    ".join(["nothing was removed:", *problems]),
@@ -109,14 +109,10 @@ def _choose(
 
 def _find_named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     """Find the recordings that a name fits: by id or exact path, else by the path's end."""
-    digits = name.lower()
-    if len(digits) == ID_DIGITS and (found := [r for r in live if r["recording_id"] == digits]):
-        return found
-    is_prefix = len(digits) >= PREFIX_DIGITS and _HEX.fullmatch(digits)
     found = [
         row
         for row in live
-        if (is_prefix and row["recording_id"].startswith(digits))
+        if (len(name) >= PREFIX_DIGITS and row["recording_id"].startswith(name.lower()))
         or _absolute(row["source_file"]) == _absolute(name)
     ]
     parts = PurePath(name).parts  # the name `b.mcap` fits `logs/b.mcap`
@@ -126,31 +122,6 @@ def _find_named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any
 
 def _absolute(path: str) -> str:
     return os.path.normpath(Path(path).absolute())
-
-
-def _explain(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
-    """Explain why a name does not select exactly one recording, and list candidates."""
-    if found:
-        what = f"{name!r} is the name of {len(found)} recordings"
-        return f"{what}: {_listed(found)}"
-    digits = name.lower()
-    if len(digits) < PREFIX_DIGITS and _HEX.fullmatch(digits):
-        begin = [row for row in live if row["recording_id"].startswith(digits)]
-        if begin:
-            least = f"{PREFIX_DIGITS} digits at least"
-            return f"{name!r} is too short for the beginning of an id ({least}): {_listed(begin)}"
-    by_path = {row["source_file"]: row for row in live}
-    files = {PurePath(path).name: path for path in by_path}
-    near = [
-        *get_close_matches(name, by_path, n=_MAX_NAMED),
-        *(files[one] for one in get_close_matches(PurePath(name).name, files, n=_MAX_NAMED)),
-    ]
-    what = f"no recording {name!r} is in the store"
-    if near := list(dict.fromkeys(near)):
-        return f"{what}; similar: {_listed([by_path[path] for path in near])}"
-    if not live:
-        return f"{what}, which has no recordings"
-    return f"{what}; it has {counted(len(live), 'recording')}: {_listed(live)}"
 
 
 def _listed(rows: Sequence[dict[str, Any]]) -> str:

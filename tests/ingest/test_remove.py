@@ -138,14 +138,15 @@ def test_recording_is_found_by_id_prefix_or_path(tmp_path, monkeypatch):
     assert len(shown(tmp_path / "s")) == 3
     for wrong, message in {
         "c.mcap": r"'c.mcap' is the name of 2 recordings: .*x/c.mcap.*logs/a/c.mcap",
-        "abcde": "too short for the beginning of an id .*logs/b.mcap.*logs/a/c.mcap|c.mcap.*b.mcap",
-        "logs/bb.mcap": r"no recording 'logs/bb.mcap' is in the store; similar: .*logs/b.mcap",
-        "fedcba98": "no recording 'fedcba98' is in the store; it has 3 recordings: .*x/c.mcap",
+        "abcde": "no recording 'abcde' is in the store",
+        "logs/bb.mcap": "no recording 'logs/bb.mcap' is in the store",
+        "fedcba98": "no recording 'fedcba98' is in the store",
         "": "no recording ''",
     }.items():
         with pytest.raises(StoreError, match=message) as error:
             remove_recordings(writer, [x, wrong])
         assert "nothing was removed" in str(error.value)
+        assert "at least its first 6 digits" in str(error.value)
     assert len(shown(tmp_path / "s")) == 3
 
 
