@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -144,16 +144,7 @@ def _problem_of_commit(file: Path) -> str | None:
 # Features that Restock supports: they concern a column type, checkpoints and vacuum, not row files.
 _READ = {"timestampNtz", "v2Checkpoint", "vacuumProtocolCheck"}
 _WRITTEN = {"timestampNtz", "v2Checkpoint"}
-# Protocol version -> features that it implies, for tables that do not list their features.
-_BY_READER_VERSION = {2: ("columnMapping",)}
-_BY_WRITER_VERSION = {
-    2: ("appendOnly", "invariants"),
-    3: ("checkConstraints",),
-    4: ("changeDataFeed", "generatedColumns"),
-    5: ("columnMapping",),
-    6: ("identityColumns",),
-}
-_LISTED_READER, _LISTED_WRITER = 3, 7  # the newest protocols, and the first with feature lists
+_NEWEST_READER, _NEWEST_WRITER = 3, 7  # protocols; these list the features that a table may use
 # Feature -> pattern of the property (of the table or a column) without which it has no effect.
 _PROPERTIES = {
     "appendOnly": r"delta\.appendOnly=true",
@@ -162,6 +153,7 @@ _PROPERTIES = {
     "columnMapping": r"delta\.columnMapping\.mode=(?!none).*",
     "invariants": r"delta\.invariants=.*",
     "generatedColumns": r"delta\.generationExpression=.*",
+    "identityColumns": r"delta\.identity\..*",
 }
 _REMOVE = (
     "take it off the table with the tool that set it (in Spark: ALTER TABLE … DROP FEATURE, DROP"
@@ -190,10 +182,13 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
         StoreError: the table uses a feature that Restock cannot read.
     """
     protocol = table.protocol()
-    required = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
-    for feature, what in _features(table, *required, _BY_READER_VERSION, "minReaderVersion"):
-        if feature not in _READ:
-            raise _unreadable(what, _name(table), where)
+    if protocol.min_reader_version == 1:  # has no such features
+        return
+    if protocol.min_reader_version > _NEWEST_READER:
+        raise _unreadable(f"reader version {protocol.min_reader_version}", _name(table), where)
+    used = _features_used(table, protocol.reader_features, _READ)
+    if unknown := [one for one in used if one not in _PROPERTIES or one == "columnMapping"]:
+        raise _unreadable(f"feature `{unknown[0]}`", _name(table), where)
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
@@ -203,31 +198,35 @@ def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) ->
         StoreError: the table uses a feature that Restock cannot write.
     """
     protocol = table.protocol()
-    required = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
-    for feature, what in _features(table, *required, _BY_WRITER_VERSION, "minWriterVersion"):
-        if feature not in _WRITTEN and (feature != "appendOnly" or removing):
-            raise _unwritable(what, _name(table), where)
+    if protocol.min_writer_version > _NEWEST_WRITER:
+        raise _unwritable(f"writer version {protocol.min_writer_version}", _name(table), where)
+    for feature in _features_used(table, protocol.writer_features, _WRITTEN):
+        if feature != "appendOnly" or removing:
+            raise _unwritable(f"feature `{feature}`", _name(table), where)
 
 
-def _features(
-    table: DeltaTable,
-    version: int,
-    newest: int,
-    listed: Sequence[str] | None,
-    by_version: Mapping[int, tuple[str, ...]],
-    key: str,
-) -> Iterator[tuple[str, str]]:
-    """Yield each feature that a table uses, with a phrase that names it in error messages.
+def _features_used(
+    table: DeltaTable, listed: Sequence[str] | None, supported: Collection[str]
+) -> list[str]:
+    """Return the features that a table lists or that its or its columns' properties turn on.
 
-    If the protocol's `version` is above the `newest` that Restock knows, yield "" for it first.
+    Those in `supported` are left out.
     """
-    if version > newest:
-        yield "", f"version {version} of the protocol ({key})"
-    features = listed if version == newest else None
-    legacy = (one for least, several in by_version.items() if least <= version for one in several)
-    for feature in features or legacy:
-        if _in_use(table, feature):
-            yield feature, f"feature `{feature}`"
+    columns = [field.metadata for field in table.schema().fields]
+    found = [
+        f"{key}={value}"
+        for properties in (table.metadata().configuration, *columns)
+        for key, value in properties.items()
+    ]
+    turned_on = [
+        feature
+        for feature, pattern in _PROPERTIES.items()
+        if any(re.fullmatch(pattern, one, re.DOTALL) for one in found)
+    ]
+    return [
+        *(one for one in listed or () if one not in supported and one not in _PROPERTIES),
+        *turned_on,
+    ]
 
 
 def _name(table: DeltaTable) -> str:
@@ -244,18 +243,6 @@ def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None
         return None
     # Naming an older version does not help: the library opens the newest first.
     return _unreadable(f"feature `{named[1]}`", name, where, otherwise=_AGAIN)
-
-
-def _in_use(table: DeltaTable, feature: str) -> bool:
-    """Return whether a table uses a feature; features not in _PROPERTIES always count as used."""
-    if feature not in _PROPERTIES:
-        return True
-    columns = [field.metadata for field in table.schema().fields]
-    return any(
-        re.fullmatch(_PROPERTIES[feature], f"{key}={value}", re.DOTALL)
-        for properties in (table.metadata().configuration, *columns)
-        for key, value in properties.items()
-    )
 
 
 def _unreadable(what: str, name: str, where: str, otherwise: str = _EARLIER) -> StoreError:
