@@ -414,44 +414,32 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
     files = store.files(TRANSITIONS)
     done.files_before = done.files_after = len(files)
     changed = _find_changed(store, files)
+    # Manifests first: once Restock has joined changed rows, their manifests' summaries are trusted.
+    plan = _Fold.of(store, changed) if dry_run else fold(store, changed)
+    plan.count(done)
     if dry_run:
         done.rows = sum(file.rows for group in groups for file in group)
         done.files_after -= sum(len(group) - 1 for group in groups)
-        if store.path.has_table(RECORDINGS):
-            _Fold.of(store, changed).count(done)
         return done
-    if changed:  # summaries first: rows joined by Restock count as its own, with trusted summaries
-        fold(store, done, changed)
-    for group in groups:  # else rows first, so that a damaged file leaves manifests unchanged
+    for group in groups:
         _merge_rows(store, group, done)
-    if not changed:
-        fold(store, done)
     return done
 
 
-def fold(
-    store: StoreWriter,
-    done: Compacted | None = None,
-    changed: Collection[str] = (),
-    *,
-    small: bool = False,
-) -> None:
+def fold(store: StoreWriter, changed: Collection[str] = (), *, small: bool = False) -> _Fold:
     """Join the manifests of all recordings, or only those in `small` files, into one file.
 
     Ingests in `changed`, whose rows another tool has changed, get new summaries.
 
     Manifests whose rows are not yet committed or were replaced keep or get a file of their own.
-    Files with many manifests stay as they are.
+    Files with many manifests stay as they are. Returns what was done.
     """
-    done = done or Compacted()
     made: dict[str, pa.Table] = {}  # ingest -> manifest with its new summary
-    if not store.path.has_table(RECORDINGS):
-        return
     store.create(RECORDINGS, recording_columns())
     for _ in range(ATTEMPTS):
         plan = _Fold.of(store, changed, small=small)
         if not plan.worth_it:
-            break
+            return plan
         _summarise(store, [one for one in plan.lacking if one.ingest_id not in made], made)
         _keep_replaced(store, plan)
         schema = delta_columns(recording_columns())
@@ -464,16 +452,14 @@ def fold(
         paths = {file.path for file in plan.chosen}
         try:
             if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
-                break
+                return plan
         finally:
             store.discard_uncommitted(RECORDINGS, [one])
-    else:
-        raise StoreError(
-            f"other writers were faster {ATTEMPTS} times",
-            where=str(store.path),
-            remedy="try again when they are done; the manifests are unchanged",
-        )
-    plan.count(done)
+    raise StoreError(
+        f"other writers were faster {ATTEMPTS} times",
+        where=str(store.path),
+        remedy="try again when they are done; the manifests are unchanged",
+    )
 
 
 def fold_if_many(store: StoreWriter) -> None:
