@@ -246,27 +246,27 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
     return _labels(_evaluate(steps, conditions, ("sql",)), conditions)
 
 
-def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F32]:
-    """Compute the probability of every condition that has one, over steps as in `label`.
-
-    Null becomes NaN.
-
-    Raises:
-        ConfigError: the SQL does not run, or its values are not numbers in [0, 1].
-    """
-    return _probabilities(_evaluate(steps, conditions, ("probability",)), conditions)
-
-
 def label_with_probabilities(
     steps: pa.Table, conditions: Sequence[Condition]
 ) -> tuple[dict[str, Bools], dict[str, F32]]:
-    """Compute `label` and `probabilities` together, which computes common parts only once.
+    """Compute `label`, and the probability of every condition that has one; null becomes NaN.
+
+    Common parts are computed only once.
 
     Raises:
-        ConfigError: as `label` and `probabilities`.
+        ConfigError: as `label`, or a probability is not a number in [0, 1].
     """
     columns = _evaluate(steps, conditions, ("sql", "probability"))
-    return _labels(columns, conditions), _probabilities(columns, conditions)
+    probable = {}
+    for condition in conditions:
+        if not condition.probability:
+            continue
+        where = _where(condition, "probability")
+        values = _numbers(columns[condition.name, "probability"], where)
+        if len(wrong := values[(values < 0) | (values > 1)]):
+            raise ConfigError(f"it must be in [0, 1], but gives {wrong[0]:.4g}", where=where)
+        probable[condition.name] = values.astype(np.float32)
+    return _labels(columns, conditions), probable
 
 
 def label_several(
@@ -314,19 +314,6 @@ def _labels(columns: Columns, conditions: Sequence[Condition]) -> dict[str, Bool
             )
         labels[condition.name] = np.ma.filled(values, False)
     return labels
-
-
-def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[str, F32]:
-    found = {}
-    for condition in conditions:
-        if not condition.probability:
-            continue
-        where = _where(condition, "probability")
-        values = _numbers(columns[condition.name, "probability"], where)
-        if len(wrong := values[(values < 0) | (values > 1)]):
-            raise ConfigError(f"it must be in [0, 1], but gives {wrong[0]:.4g}", where=where)
-        found[condition.name] = values.astype(np.float32)
-    return found
 
 
 def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:

@@ -21,10 +21,10 @@ from restock.ingest.task import conditions
 from restock.ingest.task.conditions import (
     Condition,
     label,
+    label_with_probabilities,
     labels_version,
     let_values,
     primary,
-    probabilities,
     settings_of,
     shipped,
     uncertain_steps,
@@ -424,8 +424,9 @@ def test_condition_file_parts():
     assert list(fast.let) == ["over_mps", "smooth_mps"]
     assert fast.constants == {"lidar_noise_m": 0.1}  # only the constants that it uses
     table = steps(5, wheel_speed_mps=np.array([0.5, 0.7, 0.1, 0.9, 0.9]))
-    assert label(table, [fast])["fast"].tolist() == [False, True, False, False, True]
-    probability = probabilities(table, [fast])["fast"]
+    labels, probable = label_with_probabilities(table, [fast])
+    assert labels["fast"].tolist() == [False, True, False, False, True]
+    probability = probable["fast"]
     assert np.isnan(probability[0])
     np.testing.assert_allclose(probability[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
     uncertain = uncertain_steps({"fast": probability}, [fast])["fast"]
@@ -435,7 +436,7 @@ def test_condition_file_parts():
 def test_more_noise_makes_probability_less_certain():
     table = steps(3, wheel_speed_mps=np.array([0.5, 0.7, 0.9]))
     certain, uncertain = (
-        probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5)
+        label_with_probabilities(table, [condition(noise_m=n)])[1]["fast"][2] for n in (0.05, 0.5)
     )
     assert certain > 0.95 > uncertain > 0.5
 
@@ -464,7 +465,7 @@ def test_labels_version_follows_rule_and_constants():
 )
 def test_invalid_probability_sql_is_rejected(text, message):
     with pytest.raises(ConfigError, match=message):
-        probabilities(steps(3), [condition(text)])
+        label_with_probabilities(steps(3), [condition(text)])
 
 
 def test_noise_changes_labels_version_but_not_hash():
