@@ -382,18 +382,6 @@ def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
     return [sketches[place] for place in np.flatnonzero(shared >= MIN_HASHES).tolist()]
 
 
-def looks_alike(mine: Hashes, other: Sketch) -> bool:
-    """Return whether rows with hashes `mine` (N,) may largely repeat another recording."""
-    if not len(other.hashes):
-        return False
-    # A full sketch lacks its recording's larger hashes, so compare up to its largest one only.
-    full = len(other.hashes) == SKETCH_HASHES
-    compared = mine[mine <= other.hashes[-1]] if full else mine
-    both = len(np.intersect1d(compared, other.hashes))
-    least = min(len(compared), len(other.hashes))
-    return both >= MIN_HASHES and both >= LARGELY / 2 * least
-
-
 def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
     """Return what the new rows share with those of another recording; None if it is not enough.
 
@@ -431,14 +419,13 @@ def find_repeat(
     """Return the stored recording that repeats the most of the new rows, or None.
 
     `mine` are the new rows' `distinctive` hashes. `rows()` returns the new rows, and
-    `read(recording_id, ingest_id)` a stored recording's. Both are called if a sketch looks alike.
+    `read(recording_id, ingest_id)` a stored recording's. Both are called if a sketch shares hashes.
     """
     found = []
     for one in sharing(mine, list(sketches)):
-        if looks_alike(mine, one):
-            with suppress(*UNREADABLE):
-                other = read(one.recording_id, one.ingest_id)
-                found.append(compare(rows(), other, period_s))
+        with suppress(*UNREADABLE):
+            other = read(one.recording_id, one.ingest_id)
+            found.append(compare(rows(), other, period_s))
     return max(
         (repeat for repeat in found if repeat is not None),
         key=lambda repeat: (repeat.rows, repeat.recording_id),
