@@ -42,7 +42,7 @@ from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_ta
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, explain_no_transitions, split, steps_of
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs, unknown_directions
-from restock.ingest.store.lineage import Ingest, own_path
+from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (
     LabelScore,
     correct_labels,
@@ -94,6 +94,9 @@ class IngestResult:
         return bool(self.lost_messages or self.contradictions)
 
 
+Outcome = IngestResult | StoreError | RecordingError
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A recording that was read and whose files are written, ready to commit."""
@@ -101,7 +104,6 @@ class Prepared:
     result: IngestResult  # its version and `repeats` are filled in by the commit
     staged: Staged | None = None  # None: nothing to commit
     repeated: OnRepeat | None = None  # None: do not look for the same drive in the store
-    period_s: float = 0.0  # control period
 
 
 @interrupts_raised
@@ -312,7 +314,7 @@ class _Ingest:
             [one.reported for one in steps.findings if not one.repaired],
             self._notes(steps, table),
         )
-        return Prepared(result, staged, self.repeated, profile.task.control_period_s)
+        return Prepared(result, staged, self.repeated)
 
     def _stage(
         self,
@@ -435,14 +437,12 @@ class _Ingest:
         return notes
 
 
-def commit_all(
-    store: StoreWriter, prepared: Sequence[Prepared]
-) -> list[IngestResult | StoreError | RecordingError]:
+def commit_all(store: StoreWriter, prepared: Sequence[Prepared]) -> list[Outcome]:
     """Commit recordings together; return the result of each, in their order.
 
     If one cannot be committed, the others still are. Merges the manifest files if they are many.
     """
-    outcomes: dict[int, IngestResult | StoreError | RecordingError] = {}
+    outcomes: dict[int, Outcome] = {}
     group: dict[int, Prepared] = {}
     for place, item in enumerate(prepared):
         # A later ingest of the same recording replaces the earlier one, in a commit of its own.
@@ -470,7 +470,7 @@ def _repeat_error(
         return None
     earlier = [other.staged for other in before if other.staged]
     try:
-        found = store.repeated(prepared.staged, prepared.period_s, ahead=earlier)
+        found = store.repeated(prepared.staged, ahead=earlier)
     except StoreError as error:
         return error
     if found is None or (prepared.repeated == "replace" and found.has_less):
@@ -491,7 +491,7 @@ def _removal(store: StoreWriter, recording_id: str) -> str:
 
 def _commit(
     store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
-) -> dict[int, IngestResult | StoreError | RecordingError]:
+) -> dict[int, Outcome]:
     """Commit all at once or, if that fails, one by one; `begun`: a commit with them had begun."""
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
@@ -510,8 +510,8 @@ def _commit(
     except BaseException:
         (store.take_back if begun else store.discard)(several)
         raise
-    later = [Ingest(one.recording_id, one.ingest_id, 0) for one in staged.values()]
-    found: dict[int, IngestResult | StoreError | RecordingError] = {}
+    later = [one.ingest_id for one in staged.values()]
+    found: dict[int, Outcome] = {}
     for place, one in group.items():
         later = later[1:]
         found[place] = _build_result(store, one, staged[place], version, later)
@@ -519,14 +519,14 @@ def _commit(
 
 
 def _build_result(
-    store: StoreWriter, prepared: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
+    store: StoreWriter, prepared: Prepared, staged: Staged, version: int, later: Sequence[str]
 ) -> IngestResult | StoreError:
-    """Build the result of a committed recording, ignoring the `later` ones of its commit."""
+    """Build the result of a committed recording, ignoring the `later` ingests of its commit."""
     repeats = None
     if prepared.repeated is not None:
         # Search only now, as another process may have written the same drive before the commit.
         try:
-            repeats = store.repeated(staged, prepared.period_s, aside={i.ingest_id for i in later})
+            repeats = store.repeated(staged, aside=later)
         except StoreError as error:
             return error
     notes = list(prepared.result.notes)

@@ -26,7 +26,15 @@ from deltalake import DeltaTable
 from restock.errors import StoreError, quoted
 from restock.files import first_line
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
-from restock.ingest.store.summary import UNREADABLE, Hashes, Sketch, read_sketch, with_ends
+from restock.ingest.store.summary import (
+    SKETCH_HASHES,
+    SUMMARY_SCHEMA,
+    UNREADABLE,
+    Hashes,
+    read_sketch,
+    sharing,
+    with_ends,
+)
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
@@ -230,7 +238,7 @@ def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bo
 
 
 # Store -> ingest id -> sketch. An ingest never changes; a sketch takes 2 kB.
-_SKETCHES: defaultdict[Location, dict[str, Sketch]] = defaultdict(dict)
+_SKETCHES: defaultdict[Location, dict[str, Hashes]] = defaultdict(dict)
 
 
 @dataclass(frozen=True)
@@ -447,23 +455,37 @@ class StoreReader:
         held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())
 
-    def sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
-        """Return the sketches of ingests, each read once and cached; leave out unreadable ones."""
-        names = ("recording_id", "ingest_id", "sketch")
-        schema = pa.schema([(name, pa.string()) for name in names])
+    def similar(self, mine: Hashes, ingests: Sequence[Ingest]) -> Iterator[pa.Table]:
+        """Yield the manifest rows of the ingests whose sketches share hashes with `mine`.
+
+        They have the columns that `summary.compare` needs. Unreadable manifests are left out.
+        """
+        names = sharing(mine, self._sketches(ingests))
+        columns = ("recording_id", "ingest_id", "source_file", "transitions")
+        schema = pa.schema([recording_schema().field(name) for name in columns])
+        schema = schema.append(SUMMARY_SCHEMA.field("distinctive_rows"))
+        wanted = [one for one in ingests if one.ingest_id in names]
+        for part in self._manifest_files(wanted, schema, skip=UNREADABLE):
+            for row, ingest_id in enumerate(part["ingest_id"].to_pylist()):
+                if ingest_id in names:
+                    yield part.slice(row, 1)
+
+    def _sketches(self, ingests: Sequence[Ingest]) -> dict[str, Hashes]:
+        """Return the sketch of each ingest, read once and cached; leave out unreadable ones."""
+        schema = pa.schema([("ingest_id", pa.string()), ("sketch", pa.string())])
         kept = _SKETCHES[self.path]
         new = {one.ingest_id: one for one in ingests if one.ingest_id not in kept}
         # Skip unreadable manifests: `restock sql` reports them, and this ingest need not fail.
         for part in self._manifest_files(list(new.values()), schema, skip=UNREADABLE):
-            columns = (part[name].to_pylist() for name in names)
-            for recording_id, ingest_id, text in zip(*columns, strict=True):
+            columns = (part[name].to_pylist() for name in schema.names)
+            for ingest_id, text in zip(*columns, strict=True):
                 if ingest_id in new:
-                    kept[ingest_id] = Sketch(recording_id, ingest_id, read_sketch(text or ""))
-        return [kept[one.ingest_id] for one in ingests if one.ingest_id in kept]
+                    kept[ingest_id] = read_sketch(text or "")
+        return {one.ingest_id: kept[one.ingest_id] for one in ingests if one.ingest_id in kept}
 
-    def remember(self, recording_id: str, ingest_id: str, contents: Hashes) -> None:
+    def remember(self, ingest_id: str, contents: Hashes) -> None:
         """Cache the sketch of an ingest that was just written, so that it need not be read."""
-        _SKETCHES[self.path][ingest_id] = Sketch.of(recording_id, ingest_id, contents)
+        _SKETCHES[self.path][ingest_id] = contents[:SKETCH_HASHES]
 
 
 def frame_files(manifests: pa.Table) -> list[str]:

@@ -7,8 +7,8 @@ ends of episodes. Every writer of rows also writes their summary, so the two alw
 The sketch shows whether a recording, a part or a copy of it is already in the store under another
 id. Ids are computed from a file's bytes, so a salvaged part, another cut, or a drive that was
 replayed and recorded again has another id. A sketch is the smallest hashes of a recording's rows
-(bottom-k, Broder 1997). An ingest then reads only the rows of recordings with a similar sketch. The
-audit `repeated_steps` finds repeated drives in SQL, by comparing all rows.
+(bottom-k, Broder 1997). An ingest then compares the hashes of all distinctive rows, which manifests
+store, of recordings with a similar sketch. The audit `repeated_steps` finds repeated drives in SQL.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -321,20 +320,6 @@ class RepeatedDrive:
         )
 
 
-@dataclass(frozen=True)
-class Sketch:
-    """Ids of a stored recording and its smallest row hashes, (k,) ascending, to find repeats."""
-
-    recording_id: str
-    ingest_id: str
-    hashes: Hashes
-
-    @classmethod
-    def of(cls, recording_id: str, ingest_id: str, hashes: Hashes) -> Sketch:
-        """Return the sketch of a recording with these `distinctive` hashes."""
-        return cls(recording_id, ingest_id, hashes[:SKETCH_HASHES])
-
-
 def sketch(hashes: Hashes) -> str:
     """Encode the sketch of a recording's `distinctive` hashes for its manifest."""
     return hashes[:SKETCH_HASHES].astype("<u8").tobytes().hex()
@@ -368,69 +353,45 @@ def _hashes(rows: pa.Table) -> Hashes:
     return splitmix64(total)  # mixed, so that the smallest are a random sample of the rows
 
 
-def sharing(mine: Hashes, sketches: Sequence[Sketch]) -> list[Sketch]:
-    """Return the sketches that share at least MIN_HASHES with `mine`, (N,) ascending hashes."""
+def sharing(mine: Hashes, sketches: Mapping[str, Hashes]) -> set[str]:
+    """Return the names of sketches that share at least MIN_HASHES with `mine`, (N,) ascending."""
     if not len(mine):
-        return []
-    hashes = np.concatenate([one.hashes for one in sketches] or [mine[:0]])
+        return set()
+    hashes = np.concatenate([mine[:0], *sketches.values()])
     marked = np.zeros(1 << 16, np.bool_)  # by low 16 bits: quickly excludes most hashes
     marked[mine.astype(np.uint16)] = True
     at = np.flatnonzero(marked[hashes.astype(np.uint16)])
     at = at[mine[np.minimum(np.searchsorted(mine, hashes[at]), len(mine) - 1)] == hashes[at]]
-    ends = np.cumsum([len(one.hashes) for one in sketches])
+    ends = np.cumsum([len(one) for one in sketches.values()])
     shared = np.bincount(np.searchsorted(ends, at, "right"), minlength=len(sketches))
-    return [sketches[place] for place in np.flatnonzero(shared >= MIN_HASHES).tolist()]
+    return {name for name, count in zip(sketches, shared, strict=True) if count >= MIN_HASHES}
 
 
-def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
-    """Return what the new rows share with those of another recording; None if it is not enough.
+def compare(mine: Hashes, rows: int, other: pa.Table) -> RepeatedDrive | None:
+    """Return what a recording shares with the one of the manifest row `other`.
 
-    The median shift between their stamps is subtracted. Rows whose stamps then differ by more than
-    half a control period do not count as the same.
+    `mine` are the ascending hashes of its distinctive rows, and `rows` is the number of all. None
+    if it is not enough.
     """
-    mine, my_rows = distinctive(rows)
-    theirs, their_rows = distinctive(other)
-    _, first, second = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
-    if not len(first):
-        return None
-    later = _stamps(rows)[my_rows[first]] - _stamps(other)[their_rows[second]]
-    shift = np.sort(later)[len(later) // 2]
-    same = int((np.abs(later - shift) <= period_s * 1e9 / 2).sum())
-    least = min(len(mine), len(theirs))
-    if same < MIN_HASHES or same < LARGELY * least:
+    theirs = contents_of(other)
+    same = len(np.intersect1d(mine, theirs, assume_unique=True))
+    if same < MIN_HASHES or same < LARGELY * min(len(mine), len(theirs)):
         return None
     return RepeatedDrive(
         str(other["recording_id"][0]),
         str(other["source_file"][0]),
         same,
-        same / len(rows),
-        same / len(other),
+        same / rows,
+        same / other["transitions"][0].as_py(),
         same / len(theirs),
     )
 
 
-def find_repeat(
-    mine: Hashes,
-    rows: Callable[[], pa.Table],
-    sketches: Iterable[Sketch],
-    read: Callable[[str, str], pa.Table],
-    period_s: float,
-) -> RepeatedDrive | None:
-    """Return the stored recording that repeats the most of the new rows, or None.
-
-    `mine` are the new rows' `distinctive` hashes. `rows()` returns the new rows, and
-    `read(recording_id, ingest_id)` a stored recording's. Both are called if a sketch shares hashes.
-    """
-    found = []
-    for one in sharing(mine, list(sketches)):
-        with suppress(*UNREADABLE):
-            other = read(one.recording_id, one.ingest_id)
-            found.append(compare(rows(), other, period_s))
-    return max(
-        (repeat for repeat in found if repeat is not None),
-        key=lambda repeat: (repeat.rows, repeat.recording_id),
-        default=None,
-    )
+def contents_of(manifest: pa.Table) -> Hashes:
+    """Return the hashes of a recording's distinctive rows, ascending, from its manifest row."""
+    contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
+    ascending: Hashes = np.sort(contents.to_numpy().view(np.uint64))
+    return ascending
 
 
 def distinctive(rows: pa.Table) -> tuple[Hashes, Ints]:
@@ -441,7 +402,3 @@ def distinctive(rows: pa.Table) -> tuple[Hashes, Ints]:
     found, first, counts = np.unique(row_hashes(rows), return_index=True, return_counts=True)
     once: Bools = counts == 1
     return found[once], first[once].astype(np.int64)
-
-
-def _stamps(rows: pa.Table) -> Ints:
-    return np.asarray(rows["stamp_ns"].to_numpy(), np.int64)

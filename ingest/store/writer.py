@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from deltalake.exceptions import DeltaError
@@ -52,8 +51,8 @@ from restock.ingest.store.summary import (
     UNREADABLE,
     Hashes,
     RepeatedDrive,
-    Sketch,
-    find_repeat,
+    compare,
+    contents_of,
     summarised,
 )
 from restock.ingest.task.schema import frame_schema, recording_schema
@@ -87,26 +86,26 @@ class StoreWriter(TableCommits):
         self._reached = False
 
     def repeated(
-        self,
-        recording: Staged,
-        period_s: float,
-        *,
-        ahead: Sequence[Staged] = (),
-        aside: Collection[str] = (),
+        self, recording: Staged, *, ahead: Sequence[Staged] = (), aside: Collection[str] = ()
     ) -> RepeatedDrive | None:
         """Return the stored recording that repeats most of this one's rows, or None.
 
-        Rows count as the same if their stamps differ by at most half a control period (`period_s`).
         Recordings in `ahead`, staged before this one, are compared too, but no ingests in `aside`.
         """
-        others = [one for one in self.shown() if one.ingest_id not in aside]
-        sketches = [
-            *self.sketches([one for one in others if one.recording_id != recording.recording_id]),
-            *(Sketch.of(one.recording_id, one.ingest_id, one.contents) for one in ahead),
+        others = [
+            one
+            for one in self.shown()
+            if one.ingest_id not in aside and one.recording_id != recording.recording_id
         ]
-        own = recording.recording_id, recording.ingest_id
-        return find_repeat(
-            recording.contents, lambda: self.rows(*own), sketches, self.rows, period_s
+        manifests = [
+            *self.similar(recording.contents, others),
+            *(one.manifest for one in ahead),
+        ]
+        found = (compare(recording.contents, recording.rows.rows, one) for one in manifests)
+        return max(
+            (repeat for repeat in found if repeat is not None),
+            key=lambda repeat: (repeat.rows, repeat.recording_id),
+            default=None,
         )
 
     def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
@@ -189,13 +188,12 @@ class StoreWriter(TableCommits):
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
         if "distinctive_rows" not in manifest.column_names:
             manifest = summarised(manifest, rows)
-        contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
         staged = Staged(
             *ids,
             manifest,
             AddedFile(ids[0], own_path(*ids), len(rows)),
             delta_columns(rows.schema).remove_metadata(),
-            np.sort(contents.to_numpy().view(np.uint64)),
+            contents_of(manifest),
             instead_of,
         )
         try:
@@ -221,7 +219,7 @@ class StoreWriter(TableCommits):
         with suppress(StoreError):  # the rows are committed; `clean` removes manifests without rows
             self.remove(RECORDINGS, done.replaced)
         for one in staged:
-            self.remember(one.recording_id, one.ingest_id, one.contents)
+            self.remember(one.ingest_id, one.contents)
         return done.version
 
     def _commit_manifests(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> None:

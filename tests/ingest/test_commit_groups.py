@@ -29,7 +29,7 @@ def prepared(
     instead_of: str | None = None,
 ) -> Prepared:
     staged = store.stage(*recording, instead_of=instead_of)
-    return Prepared(IngestResult("x", "written", {}), staged, repeated, 0.2)
+    return Prepared(IngestResult("x", "written", {}), staged, repeated)
 
 
 @pytest.fixture

@@ -126,7 +126,7 @@ def test_compacted_store_accepts_writes_and_compactions(place):
     assert kept.to_pylist() == one(3)[1].to_pylist()
     assert as_written.to_pylist() == one(2)[1].to_pylist()
     copy = replaced(kept, {"recording_id": "f" * 16, "ingest_id": "copy"})
-    assert writer.repeated(writer.stage(manifest(copy), copy), 0.2) is not None
+    assert writer.repeated(writer.stage(manifest(copy), copy)) is not None
 
 
 def test_dry_run_writes_nothing_and_second_run_has_no_work(writer, tmp_path, capsys, shell):

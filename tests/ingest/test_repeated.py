@@ -11,7 +11,7 @@ from support.shell import Shell
 from support.stores import manifest, recording_transitions
 
 from restock.cli import main
-from restock.ingest.store.summary import SKETCH_HASHES, Sketch, row_hashes, sharing
+from restock.ingest.store.summary import SKETCH_HASHES, row_hashes, sharing
 from restock.ingest.store.writer import StoreWriter
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
@@ -49,11 +49,10 @@ def test_sketches_with_common_hashes_are_found():
     mixed = [
         np.concatenate([part[:n], other]) for n, other in enumerate(unrelated) for part in parts
     ]
-    sketches = [
-        Sketch("", "", np.sort(sketch)) for sketch in [*parts, *mixed, *unrelated, mine[:0]]
-    ]
-    assert sharing(mine, sketches) == sketches[: len(parts)]
-    assert sharing(mine, []) == sharing(mine[:0], sketches) == []
+    every = [*parts, *mixed, *unrelated, mine[:0]]
+    sketches = {str(place): np.sort(sketch) for place, sketch in enumerate(every)}
+    assert sharing(mine, sketches) == {str(place) for place in range(len(parts))}
+    assert sharing(mine, {}) == sharing(mine[:0], sketches) == set()
 
 
 def test_longer_recording_after_its_part_is_reported(part, third, tmp_path, shell):
@@ -111,10 +110,10 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
         rows = recording_transitions(index, episodes=40)
         assert len(rows) > 2 * SKETCH_HASHES
         staged = store.stage(manifest(rows), rows)
-        assert store.repeated(staged, 0.2) is None
+        assert store.repeated(staged) is None
         store.fit([staged])
         store.commit_staged([staged])
-        assert store.repeated(staged, 0.2) is None
+        assert store.repeated(staged) is None
 
 
 def test_row_hashes_resolve_one_thousandth() -> None:
