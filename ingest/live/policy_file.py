@@ -39,11 +39,11 @@ MAX_BYTES = 16 << 20  # limit of a file: 4 million weights, which take .8 GB at 
 MAX_PARTS = 256  # nodes, constants, metadata entries
 MAX_WIDTH = 1 << 16  # numbers that a node computes from one observation
 _TOO_LONG = f"is longer than {MAX_BYTES >> 20} MiB"
-ROWS = "N"  # first dimension of values that are computed from observations
+ROWS = (1 << 31) - 1  # stands for N, the first dimension of values computed from observations
 _EXPORT = "restock export RUN --to onnx --out policy.onnx"
 _DIGEST = "sha256"
 
-Shape = tuple[int | str, ...]  # (N, k) of computed values; only numbers for constants
+Shape = tuple[int, ...]
 
 
 class PolicyFile:
@@ -292,7 +292,7 @@ def graph_shapes(model: Any) -> dict[str, Shape]:
         except (ValueError, IndexError) as error:
             every = ", ".join(_shape_text(shapes[name]) for name in node.input)
             raise ValueError(f"does not fit: {node.op_type} of {every}") from error
-        width = math.prod(size for size in shape if not isinstance(size, str))
+        width = math.prod(size for size in shape if size != ROWS)
         if width > MAX_WIDTH or ROWS in shape[1:]:
             raise ValueError(f"computes {_shape_text(shape)}, more than {MAX_WIDTH} numbers a row")
         add(node.output[0], shape)
@@ -328,13 +328,7 @@ def _same_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: 
 
 
 def _broadcast_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
-    rank = max(map(len, shapes))
-    aligned = [(1,) * (rank - len(shape)) + shape for shape in shapes]
-    result: list[int | str] = []
-    for sizes in zip(*aligned, strict=True):
-        (size,) = set(sizes) - {1} or {1}  # ValueError for two sizes other than 1
-        result.append(size)
-    return tuple(result)
+    return np.broadcast_shapes(*shapes)
 
 
 def _product_shape(shapes: Sequence[Shape], settings: Mapping[str, float], values: Any) -> Shape:
@@ -377,4 +371,5 @@ ONNX_OPERATORS: dict[str, Rule] = {  # all operators that a policy may have
 
 
 def _shape_text(shape: Shape) -> str:
-    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+    sizes = ["N" if size == ROWS else str(size) for size in shape]
+    return f"({', '.join(sizes)}{',' if len(shape) == 1 else ''})"
