@@ -89,22 +89,26 @@ def sandbox() -> duckdb.DuckDBPyConnection:
 @lru_cache(maxsize=1024)
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
     """Return why a condition may not have this SQL, or None; unknown names are left to DuckDB."""
-    with sandbox().cursor() as connection:
-        query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
-        # SQL that closes our bracket and opens another one parses in one kind of brackets only.
-        both = [SELECT.format(columns=f"{a}{sql}\n{b}", source="steps") for a, b in ("()", "[]")]
-        ((text, other),) = connection.execute(query, both).fetchall()
+    # SQL that closes our bracket and opens another one parses in one kind of brackets only.
+    both = (SELECT.format(columns=f"{a}{sql}\n{b}", source="steps") for a, b in ("()", "[]"))
     try:
-        return _read(json.loads(text), timing) or (
-            _UNBALANCED if json.loads(other)["error"] else None
-        )
+        parsed, in_square = map(_parse, both)
+        return _read(parsed, timing) or (_UNBALANCED if in_square["error"] else None)
     except RecursionError:
         return "it nests too deeply"
 
 
+def _parse(query: str) -> dict[str, Any]:
+    """Return DuckDB's tree of a query, or its `error_message`."""
+    with sandbox().cursor() as connection:
+        ((text,),) = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [query]).fetchall()
+    parsed: dict[str, Any] = json.loads(text)
+    return parsed
+
+
 def _read(parsed: dict[str, Any], timing: str) -> str | None:
     if parsed["error"]:
-        return "its SQL cannot be read: " + str(parsed["error_message"]).splitlines()[0]
+        return _unreadable(parsed)
     statements = parsed["statements"]
     node = statements[0]["node"]
     if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
@@ -115,6 +119,10 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
         if reason := _refuse(part, timing):
             return reason
     return None
+
+
+def _unreadable(parsed: dict[str, Any]) -> str:
+    return "its SQL cannot be read: " + str(parsed["error_message"]).splitlines()[0]
 
 
 def _is_own_query(node: dict[str, Any]) -> bool:
@@ -221,10 +229,8 @@ def _window_back(part: dict[str, Any]) -> int | None:
 
 def _parsed(sql: str) -> Iterator[dict[str, Any]]:
     """Yield every node of an expression that `refusal` accepts."""
-    with sandbox().cursor() as connection:
-        query = SELECT.format(columns=f"({sql}\n)", source="steps")
-        ((text,),) = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [query]).fetchall()
-    return _walk(json.loads(text)["statements"][0]["node"]["select_list"])
+    parsed = _parse(SELECT.format(columns=f"({sql}\n)", source="steps"))
+    return _walk(parsed["statements"][0]["node"]["select_list"])
 
 
 def _column(part: dict[str, Any]) -> str:
@@ -275,16 +281,11 @@ def _volatile() -> frozenset[str]:
 @lru_cache(maxsize=1024)
 def expression_problem(sql: str) -> str | None:
     """Return why this SQL is not one expression that can be put into brackets, or None."""
-    with sandbox().cursor() as connection:
-        query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
-        both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # two kinds of brackets, as in `refusal`
-        ((text, other),) = connection.execute(query, both).fetchall()
-    parsed, in_square = json.loads(text), json.loads(other)
+    # Two kinds of brackets, as in `refusal`.
+    parsed, in_square = _parse(f"SELECT ({sql}\n)"), _parse(f"SELECT [{sql}\n]")
     if not in_square["error"]:
         return None
-    if not parsed["error"]:
-        return f"{_BRACKETS}: it must be one expression"
-    return f"its SQL cannot be read: {str(parsed['error_message']).splitlines()[0]}"
+    return _unreadable(parsed) if parsed["error"] else f"{_BRACKETS}: it must be one expression"
 
 
 @lru_cache(maxsize=1024)
@@ -293,10 +294,7 @@ def repeatability_problem(sql: str) -> str | None:
 
     Also None for SQL that cannot be parsed: `expression_problem` refuses that.
     """
-    with sandbox().cursor() as connection:
-        query = "SELECT json_serialize_sql(?::VARCHAR)"
-        ((text,),) = connection.execute(query, [f"SELECT ({sql}\n)"]).fetchall()
-    for part in _walk(json.loads(text).get("statements", [])):
+    for part in _walk(_parse(f"SELECT ({sql}\n)").get("statements", [])):
         kind = part["class"]
         name = part.get("function_name", "").lower()
         if kind == "COLUMN_REF" and len(part["column_names"]) == 1:  # e.g. current_date without ()
