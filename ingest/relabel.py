@@ -41,7 +41,6 @@ from restock.ingest.store.transitions import episode_ends, label_columns, replac
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     Condition,
-    Kind,
     held,
     label_with_probabilities,
     labels_version,
@@ -81,8 +80,7 @@ def relabel_store(
     written).
 
     Raises:
-        StoreError: rows lack the ends of their episodes (an old version wrote them), or another
-            process changed them meanwhile.
+        StoreError: another process changed the rows meanwhile.
         ConfigError: a condition's SQL fails on the stored signals.
     """
     outcomes: list[Relabelled] = []
@@ -113,25 +111,19 @@ def relabel_rows(
     `definitions` are the outcomes and exposures.
 
     Raises:
-        StoreError: its rows lack the ends of their episodes: an old version wrote them.
         ConfigError: a condition's SQL fails on the stored signals.
     """
     rows = store.rows(row["recording_id"], row["ingest_id"])
     ends = episode_ends(rows)
-    if ends is None:
-        raise StoreError(
-            f"the rows of {row['source_file']} lack the ends of their episodes",
-            where=str(store.path),
-            remedy="ingest the recording again",
-        )
-    stored = rows.select(ends.column_names)  # the signals, including the profile's own
+    assert ends is not None, "ingest writes the ends of all episodes"
+    signals = rows.select(ends.column_names)  # including the profile's own
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     conditions, exposures = (
         reported(several, lidar=task.lidar, driven_plan=driven_plan(rows))
         for several in (every_condition, every_exposure)
     )
-    steps = pa.concat_tables([stored, ends.cast(stored.schema)])
+    steps = pa.concat_tables([signals, ends.cast(signals.schema)])
     try:
         every, probable = label_with_probabilities(steps, [*conditions, *exposures])
     except ConfigError as error:
@@ -265,20 +257,16 @@ def correct_store(
 def remove_corrections(
     store: StoreWriter, *, dry_run: bool = False
 ) -> tuple[list[Corrected], int | None]:
-    """Remove all corrections from a store, which restores the labels that the rules give.
-
-    Raises:
-        StoreError: rows lack the ends of their episodes: an old version wrote them.
-    """
+    """Remove all corrections from a store, which restores the labels that the rules give."""
     outcomes: list[Corrected] = []
     live = [row for row in store.live().to_pylist() if row[COLUMN]]
 
     def plain() -> Iterator[tuple[pa.Table, pa.Table]]:
         for row in live:
-            conditions = stored_conditions(row)
+            conditions = stored(row)
             before = store.rows(row["recording_id"], row["ingest_id"])
             manifest, rows, _ = relabel_rows(
-                store, row | {COLUMN: []}, [*conditions, *stored_conditions(row, "exposure")]
+                store, row | {COLUMN: []}, [*conditions, *stored(row, "exposure")]
             )
             outcomes.append(_build_outcome(row, before, rows, corrections_in(row), conditions))
             yield manifest, rows
@@ -287,28 +275,12 @@ def remove_corrections(
     return outcomes, _write(store, plain(), replaced_ingests, dry_run)
 
 
-def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """Return the conditions of a kind that labelled a recording, from its manifest.
-
-    Raises:
-        StoreError: a newer Restock wrote them.
-    """
-    try:
-        return stored(manifest, kind)
-    except msgspec.MsgspecError as error:
-        raise StoreError(
-            f"the conditions in its manifest cannot be read: {error}",
-            where=str(manifest["source_file"]),
-            remedy="they were written by a newer Restock: use that version",
-        ) from error
-
-
 def _correct_recording(
     store: StoreWriter, row: dict[str, Any], given: Sequence[Correction]
 ) -> tuple[pa.Table, pa.Table, Corrected]:
     """Return the corrected manifest and rows of one recording."""
     before = store.rows(row["recording_id"], row["ingest_id"])
-    conditions, offset_ns = stored_conditions(row), row["clock_offset_ns"]
+    conditions, offset_ns = stored(row), row["clock_offset_ns"]
     every = merged(corrections_in(row), given, Moments.of(before, offset_ns))
     rows, every = correct_labels(before, every, conditions, offset_ns)
     ingest_id = uuid.uuid4().hex[:16]

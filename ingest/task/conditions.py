@@ -160,11 +160,7 @@ def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:
 
 
 def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """Read the conditions of a kind from a row of the manifest (the `recordings` table).
-
-    Raises:
-        msgspec.MsgspecError: a newer Restock wrote the row.
-    """
+    """Read the conditions of a kind from a row of the manifest (the `recordings` table)."""
     text = manifest["conditions_json" if kind == "outcome" else "exposures_json"]
     read = msgspec.json.decode(text, type=list[Condition], strict=False)
     return [msgspec.structs.replace(condition, kind=kind) for condition in read]

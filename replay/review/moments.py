@@ -20,10 +20,9 @@ from restock.arrays import F32, F64
 from restock.errors import ConfigError, RestockError, StoreError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.relabel import stored_conditions
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.needs import read_topics
-from restock.ingest.task.conditions import Condition, let_values, shipped
+from restock.ingest.task.conditions import Condition, let_values, shipped, stored
 from restock.ingest.task.task import Body, Task
 from restock.replay.store.frames import camera_frames
 from restock.replay.store.store import Store
@@ -99,7 +98,7 @@ class Moments:
         if last > part.stop:
             notes.append(f"the event is long: its first {MAX_STEPS} steps are shown")
         condition = self._condition(manifest, event["condition"])
-        names = [one.name for one in stored_conditions(manifest)]
+        names = [one.name for one in stored(manifest)]
         return {
             "steps": window["step_index"].to_pylist(),
             "t": self._times(event, window),
@@ -257,7 +256,7 @@ class Moments:
 
     @staticmethod
     def _condition(manifest: Mapping[str, Any], name: str) -> Condition:
-        found = {one.name: one for one in stored_conditions(manifest)}[name]
+        found = {one.name: one for one in stored(manifest)}[name]
         doc = ""
         with suppress(RestockError):
             own = parse_profile(manifest["profile_toml"], where="").definitions
