@@ -13,8 +13,7 @@ from __future__ import annotations
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,7 +24,6 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import (
-    ConfigError,
     RecordingError,
     RestockError,
     StoreError,
@@ -214,15 +212,12 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
 
 def _has_other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
     """Return whether a recording was ingested with another [robot] in its profile."""
-    stored = _stored_profile(before["profile_toml"])
-    return stored is not None and stored.robot != profile.robot
+    return _stored_profile(before["profile_toml"]).robot != profile.robot
 
 
 @lru_cache(maxsize=64)  # many recordings share a profile
-def _stored_profile(text: str) -> Profile | None:
-    with suppress(ConfigError):  # another version of Restock may have written it
-        return parse_profile(text, where="profile_toml")
-    return None
+def _stored_profile(text: str) -> Profile:
+    return parse_profile(text, where="profile_toml")
 
 
 def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> Staged:
@@ -296,7 +291,7 @@ class _Ingest:
         if store:
             row = pa.Table.from_pylist([manifest], recording_schema())
             row = yield summarise, (row, table)
-            staged = self._stage(store, manifest, row, table, kept)
+            staged = self._stage(store, row, table, kept, file)
         holding = held(table["conditions"], list(rows.labels))
         counts = {name: int(holds.sum()) for name, holds in holding.items()}
         counts[NOMINAL] = first[NOMINAL]
@@ -319,44 +314,37 @@ class _Ingest:
     def _stage(
         self,
         store: StoreWriter,
-        manifest: dict[str, Any],
         row: pa.Table,
         table: pa.Table,
         kept: Sequence[KeptFrames],
+        file: str,
     ) -> Staged:
         # With corrections, fail if another process has made further ones since they were read.
         read = self.before["ingest_id"] if self.corrections else None
-        with self._writing_frames(store, manifest, kept):
+        if not file:
             return store.stage(row, table, instead_of=read)
+        try:
+            self._write_frames(store, kept, file)
+            return store.stage(row, table, instead_of=read)
+        except BaseException:
+            store.discard_frames(file)
+            raise
 
-    @contextmanager
-    def _writing_frames(
-        self, store: StoreWriter, manifest: Mapping[str, Any], kept: Sequence[KeptFrames]
-    ) -> Iterator[None]:
-        """Write the camera frames to their file, and delete the file again if the block fails.
+    def _write_frames(self, store: StoreWriter, kept: Sequence[KeptFrames], file: str) -> None:
+        """Write the camera frames to their file.
 
         Raises:
             RecordingError: a frame that was read before is missing now.
         """
-        file = next((row["file"] for row in manifest["cameras"] if row["file"]), "")
-        if not file:
-            yield
-            return
         count = store.write_frames(
             file, (batch for one in kept for batch in frame_rows(self.recording, one))
         )
-        try:
-            if count != (due := sum(len(one.row) for one in kept)):
-                raise RecordingError(
-                    f"{due - count} of {due} frames are missing: the recording changed in the "
-                    "meantime",
-                    where=self.path,
-                    remedy="ingest it again",
-                )
-            yield
-        except BaseException:
-            store.discard_frames(file)
-            raise
+        if count != (due := sum(len(one.row) for one in kept)):
+            raise RecordingError(
+                f"{due - count} of {due} frames are missing: the recording changed in the meantime",
+                where=self.path,
+                remedy="ingest it again",
+            )
 
     def _count_messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
