@@ -359,8 +359,8 @@ def _evaluate(
 ) -> Columns:
     """Evaluate the expressions `which` of all conditions over the steps.
 
-    Conditions with the same `let`s and constants share a query. If the query fails, each of its
-    expressions runs alone, so that the error names the condition.
+    Conditions with the same `let`s and constants share a query. If it fails, each of its
+    expressions runs alone.
     """
     requested = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
     together: dict[str, list[tuple[Condition, Expression]]] = {}  # FROM clause -> its expressions
@@ -385,16 +385,12 @@ def _evaluate(
             left_s = max(limit_s - (time.monotonic() - began), 0.0)
             try:
                 columns |= _query(connection, several, len(steps), left_s)
-            except duckdb.Error as together_error:
-                for condition, part in several:
+            except duckdb.Error:  # run each alone, so that an error names the condition
+                for one in several:
                     try:
-                        _query(
-                            connection, [(condition, part)], len(steps), limit_s / len(requested)
-                        )
+                        columns |= _query(connection, [one], len(steps), limit_s / len(requested))
                     except duckdb.Error as error:
-                        _raise_reason(error, steps, _where(condition, part), limit_s)
-                names = ", ".join(repr(condition.name) for condition, _ in several)
-                _raise_reason(together_error, steps, f"the conditions {names}", limit_s)
+                        _raise_reason(error, steps, _where(*one), limit_s)
     return columns
 
 
