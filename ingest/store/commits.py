@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Schema, Transaction
@@ -504,15 +503,5 @@ def delta_columns(schema: pa.Schema) -> pa.Schema:
 def plain_lists(rows: pa.Table) -> pa.Table:
     """Convert fixed-size lists in rows to plain lists, without copying the values."""
     schema = delta_columns(rows.schema).with_metadata(rows.schema.metadata)
-    columns = []
-    for field, column in zip(schema, rows.columns, strict=True):
-        if pa.types.is_fixed_size_list(column.type) and not column.null_count:
-            column = pa.chunked_array([_plain(c, field.type) for c in column.chunks], field.type)
-        columns.append(column)
-    return pa.table(columns, schema=schema)
-
-
-def _plain(lists: pa.FixedSizeListArray, kind: pa.DataType) -> pa.ListArray:
-    size = lists.type.list_size
-    offsets = pa.array(np.arange(len(lists) + 1) * size, pa.int32())
-    return pa.ListArray.from_arrays(offsets, lists.flatten(), type=kind)
+    columns = zip(rows.columns, schema, strict=True)
+    return pa.table([column.cast(field.type) for column, field in columns], schema=schema)
