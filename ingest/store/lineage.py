@@ -134,14 +134,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
         actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
         for column in ("path", "num_records", "size_bytes", "modification_time")
     ]
-    files = [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
-    if damaged := next((path for path, *_ in files if "\0" in path), None):
-        raise StoreError(
-            f"its log names an impossible file: {damaged}",
-            where=table.table_uri,
-            remedy="restore the newest commits of its _delta_log from a copy",
-        )
-    return files
+    return [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
 
 
 @contextmanager
@@ -193,12 +186,10 @@ def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
 
 def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
     """Return a row per file and ingest: recording_id, ingest_id, rows, file."""
-    every = [(*one, file.path) for file in files for one in file.ingests]
-    names = ("recording_id", "ingest_id", "rows", "file")
-    types = (pa.string(), pa.string(), pa.int64(), pa.string())
-    columns = zip(*every, strict=True) if every else [()] * len(names)
-    arrays = [pa.array(list(c), t) for c, t in zip(columns, types, strict=True)]
-    return pa.table(dict(zip(names, arrays, strict=True)))
+    text, number = pa.string(), pa.int64()
+    columns = {"recording_id": text, "ingest_id": text, "rows": number, "file": text}
+    rows = [{**one._asdict(), "file": file.path} for file in files for one in file.ingests]
+    return pa.Table.from_pylist(rows, pa.schema(list(columns.items())))
 
 
 def _parse_own_path(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
