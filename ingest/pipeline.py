@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -149,11 +148,11 @@ def preparing(
     profile: Profile,
     *,
     store: StoreWriter | None,
-    force: bool = False,
-    salvage: bool = False,
-    definitions: str | None = None,
-    repeated: OnRepeat = "keep",
-    tags: Mapping[str, str] = MappingProxyType({}),
+    force: bool,
+    salvage: bool,
+    definitions: str | None,
+    repeated: OnRepeat,
+    tags: Mapping[str, str],
     watch: Watch | None = None,
     settle: Callable[[str], None] = lambda recording_id: None,
 ) -> Work[Prepared]:

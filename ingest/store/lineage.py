@@ -35,7 +35,6 @@ from restock.ingest.store.summary import (
     sharing,
     with_ends,
 )
-from restock.ingest.store.version import Version
 from restock.ingest.task.schema import DOCUMENTS, recording_schema
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/([^/]+)\.parquet")
@@ -256,7 +255,7 @@ class _Listing:
 
 
 class StoreReader:
-    """Reader of a store's files and manifests, at the newest version or an older one.
+    """Reader of a store's files and manifests, at the newest version.
 
     The reader caches what it has read of the logs and of joined manifests, and later reads only
     what was added.
@@ -271,21 +270,10 @@ class StoreReader:
         """Raise StoreError if the place cannot be reached or only one of the tables exists."""
         self.path.expect_both_tables()
 
-    def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
-        """Return the manifest rows of recordings (or of one) whose transitions are in the store.
-
-        `version` None is the newest.
-        """
-        schema = recording_schema()
-        shown = [one for one in self.shown(version) if recording_id in (None, one.recording_id)]
-        found = self.manifests(shown, schema)
-        if version is not None and len(found) < len(shown):
-            raise StoreError(
-                "this version can no longer be read: manifests of it are gone",
-                where=str(self.path),
-                remedy="name a newer version, or restore them from a copy",
-            )
-        return found
+    def live(self, recording_id: str | None = None) -> pa.Table:
+        """Return the manifest rows of recordings (or of one) whose transitions are in the store."""
+        shown = [one for one in self.shown() if recording_id in (None, one.recording_id)]
+        return self.manifests(shown, recording_schema())
 
     def manifest(self, recording_id: str) -> dict[str, Any] | None:
         """Return the manifest row of a recording whose transitions are in the store, or None.
@@ -407,10 +395,8 @@ class StoreReader:
         reported = self.manifests(ingests, schema)
         return dict(zip(*(reported[name].to_pylist() for name in schema.names), strict=True))
 
-    def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
+    def files(self, name: str) -> list[StoredFile]:
         """Return the active files of a table, with their ingests."""
-        if version is not None:
-            return stored_files(self.path, name, self.path.open_table(name, version))
         return self._listing(name).files
 
     def _listing(self, name: str) -> _Listing:
@@ -439,11 +425,11 @@ class StoreReader:
             self._listings.pop(name, None)
         return table.version()
 
-    def shown(self, version: Version | None = None) -> list[Ingest]:
+    def shown(self) -> list[Ingest]:
         """Return the ingests whose transitions are in the store."""
         if not self._exists():
             return []
-        held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
+        held = [one for file in self.files(TRANSITIONS) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())
 
     def similar(self, mine: Hashes, ingests: Sequence[Ingest]) -> Iterator[pa.Table]:

@@ -264,9 +264,7 @@ class Limited:
         return np.asarray(self.rule != NONE, np.bool_)
 
 
-def limit(
-    limits: Limits, proposed: F64, clearance_m: F64, previous: F64, unknown: Bools | None = None
-) -> Limited:
+def limit(limits: Limits, proposed: F64, clearance_m: F64, previous: F64) -> Limited:
     """Limit the proposed commands.
 
     Limiting never increases a speed or yaw rate, nor changes its sign. The nearer a return, the
@@ -276,13 +274,10 @@ def limit(
         proposed: (N, 2) speed in m/s and yaw rate in rad/s.
         clearance_m: (N, K) the signal `sector_clearance_m`; K is 0 without a lidar.
         previous: (N, 2) the commands in force until now.
-        unknown: (N,) whether an input of the robot is unreliable; None: all are reliable.
     """
     reported = np.isfinite(np.concatenate([proposed, previous], axis=1))  # (N, 4)
     blind: Bools = ~reported.all(axis=1)
     blind |= np.isnan(clearance_m).any(axis=1)
-    if unknown is not None:
-        blind |= unknown
     command = np.where(blind[:, None], 0.0, proposed)
     rule = np.where(blind, UNKNOWN, NONE).astype(np.int64)
 

@@ -122,14 +122,11 @@ def test_only_obstacles_in_the_way_limit_speed(
     assert found.command[0].any() == (rule == "none" and any(command))
 
 
-@pytest.mark.parametrize("bad", ["command", "clearance", "before", "stale"])
+@pytest.mark.parametrize("bad", ["command", "clearance", "before"])
 def test_unknown_input_stops_robot(bad: str) -> None:
     command, before, clearance = np.array([[1.0, 0.1]]), np.array([[1.0, 0.1]]), FREE.copy()
-    {"command": command, "before": before, "clearance": clearance}.get(bad, FREE.copy())[0, 1] = (
-        np.nan
-    )
-    stale = np.array([bad == "stale"])
-    found = limit(LIMITS, command, clearance, before, stale)
+    {"command": command, "before": before, "clearance": clearance}[bad][0, 1] = np.nan
+    found = limit(LIMITS, command, clearance, before)
     assert not found.command.any()
     assert RULES[found.rule[0]] == "unknown"
 
