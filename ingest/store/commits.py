@@ -341,8 +341,8 @@ class TableCommits(StoreReader):
     ) -> int | None:
         """Replace the files `gone` of a table by the files `made`, all or nothing.
 
-        Returns the table's version, or None if another writer has removed one of `gone` meanwhile.
-        Then, and after an error, the caller deletes what it wrote (`discard_uncommitted`).
+        Returns the table's version. If another writer has removed one of `gone` meanwhile, deletes
+        `made` and returns None.
         """
 
         def attempt() -> int | None:
@@ -361,7 +361,11 @@ class TableCommits(StoreReader):
             table.update_incremental()
             return table.version()
 
-        return self.retry_on_conflict(attempt)
+        with self.discarded_on_failure(name, made):
+            version = self.retry_on_conflict(attempt)
+        if version is None:
+            self.discard_uncommitted(name, made)
+        return version
 
     @contextmanager
     def discarded_on_failure(self, name: str, files: Sequence[AddedFile]) -> Iterator[None]:

@@ -1,28 +1,29 @@
-"""Find damaged files of a store, replace or remove them, and report the recordings that are lost.
+"""Find damaged files of a store, repair or remove them, and report the recordings that are lost.
 
 Every page of a store's Parquet files has a checksum, which DuckDB does not verify. So each file is
 read whole once before its rows are used, and the store keeps a list of the files that passed. A
-damaged file is removed from its table. If it was a joined file (see `restock store compact`), the
-recordings' own files that it replaced are used again while they are kept. The other recordings
-whose rows or manifests were in it are reported: no view shows them until they are ingested again. A
-readable file is never removed. Other writers may continue meanwhile.
+damaged joined file (see `restock store compact`) is joined again from its source files while they
+are kept. If they are gone, the file is removed from its table, and the recordings whose rows or
+manifests were in it are reported: no view shows them until they are ingested again. A readable file
+is never removed. Other writers may continue meanwhile.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pyarrow as pa
 import pyarrow.fs
 
 from restock.errors import StoreError, counted, quoted
-from restock.ingest.store.commits import READ_ROWS, AddedFile
+from restock.ingest.store.commits import READ_ROWS, merge
 from restock.ingest.store.lineage import (
     OWN_PATH,
     StoredFile,
@@ -32,7 +33,7 @@ from restock.ingest.store.lineage import (
     damage_remedy,
     frame_files,
     is_system_error,
-    own_path,
+    read_stored_file,
     stored_files,
 )
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location, open_parquet
@@ -78,47 +79,43 @@ class Verified:
 class Dropped:
     """What was done with damaged files, or would be. Paths of files are relative to the store."""
 
+    joined_again: list[str] = field(default_factory=list)
     dropped: list[str] = field(default_factory=list)
-    restored: list[str] = field(default_factory=list)  # recordings' own files that are used again
     lost: list[LostRecording] = field(default_factory=list)
     unnamed_transitions: int = 0  # lost rows of recordings whose manifests are lost as well
 
 
 def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
-    """Replace or remove the damaged files of a store's tables. Every file is read whole.
+    """Repair or remove the damaged files of a store's tables. Every file is read whole.
 
     Raises:
         StoreError: there is no store, it cannot be reached or written, or a file cannot be read
             for a reason other than damage.
     """
     store.expect_store()
-    damaged: dict[str, dict[str, int]] = {}  # table -> path -> rows, as counted in Delta's log
+    done = Dropped()
+    lost_rows = 0  # as counted in Delta's log
     readable: dict[str, list[StoredFile]] = {}
-    for name in (TRANSITIONS, RECORDINGS):
+    for name in (TRANSITIONS, RECORDINGS):  # rows first: only manifests of remaining rows are kept
         table = store.path.open_table(name)
         rows = {path: count or 0 for path, count, *_ in active_files(table)}
-        broken = _find_damaged(store.path, [f"{name}/{path}" for path in rows])
-        damaged[name] = {path: rows[path] for path in rows if f"{name}/{path}" in broken}
-        readable[name] = stored_files(store.path, name, table, without=damaged[name])
-    done = Dropped()
-    lost = _find_lost(store.path, readable, damaged)
-    for name, paths in damaged.items():
-        missing = [own_path(*ids) for ids in lost[name]]
-        made = [file for path in missing if (file := _own_file(store.path, name, path))]
-        if not paths or (
-            not dry_run and store.replace_files(name, paths.keys(), made, OPERATION) is None
-        ):
-            continue  # no file is damaged, or another process has replaced or removed one
-        if not dry_run and name == RECORDINGS:  # readers would still find these by their paths
-            store.path.delete(f"{name}/{path}" for path in paths if OWN_PATH.fullmatch(path))
-        done.dropped += [f"{name}/{path}" for path in paths]
-        done.restored += [f"{name}/{file.path}" for file in made]
-        restored = {file.path for file in made}
-        done.lost += [one for ids, one in lost[name].items() if own_path(*ids) not in restored]
+        broken = _find_damaged(store.path, _in_table(name, rows))
+        damaged = [path.removeprefix(f"{name}/") for path in broken]
+        readable[name] = stored_files(store.path, name, table, without=damaged)
+        for path in damaged:
+            sources = _sources(store.path, name, path, rows[path], readable)
+            if not dry_run and not _replace(store, name, path, sources):
+                continue  # another process has replaced or removed the file
+            if sources:
+                done.joined_again.append(f"{name}/{path}")
+                readable[name] += sources
+            else:
+                done.dropped.append(f"{name}/{path}")
+                lost_rows += rows[path] if name == TRANSITIONS else 0
+    done.lost = _find_lost(store.path, readable, done.dropped)
     if any(path.startswith(f"{RECORDINGS}/") for path in done.dropped):
-        named = sum(one.transitions for one in lost[TRANSITIONS].values())
-        done.unnamed_transitions = max(0, sum(damaged[TRANSITIONS].values()) - named)
-    done.lost.sort(key=lambda one: (one.source_file, one.recording_id))
+        named = sum(one.transitions for one in done.lost if one.corrections is not None)
+        done.unnamed_transitions = max(0, lost_rows - named)
     return done
 
 
@@ -237,50 +234,91 @@ def is_damaged(place: Location, path: str) -> bool:
             return True
 
 
-def _own_file(place: Location, name: str, path: str) -> AddedFile | None:
-    """Return the file that an ingest wrote, to be added to its table again; None if it is gone."""
-    if is_damaged(place, f"{name}/{path}"):
-        return None
-    with place.reading(f"{name}/{path}") as source:
-        rows = open_parquet(source).metadata.num_rows
-        return AddedFile(path.partition("/")[0], path, rows, source.size())
+def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
+    """Return the files that a damaged file was joined from, each with only the ingests to restore.
+
+    The list is empty if a source is gone or damaged, or if the sources lack rows of the file. It is
+    also empty for a file that one ingest wrote: its commit removed only rows that it replaced.
+    """
+    if OWN_PATH.fullmatch(path):
+        return []
+    paths = _find_joined_files(place, name, path)
+    if any(is_damaged(place, one) for one in _in_table(name, paths)):
+        return []
+    there = [one for file in readable[TRANSITIONS] for one in file.ingests]
+    known = {one.recording_id for one in there}  # these have rows, maybe of a newer ingest
+    reported = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
+    unlisted = {one.ingest_id for one in there} - reported
+    found = []
+    for file in (read_stored_file(place, name, one) for one in paths):
+        kept = [
+            one
+            for one in file.ingests
+            if (one.recording_id not in known if name == TRANSITIONS else one.ingest_id in unlisted)
+        ]
+        if kept:
+            found.append(file._replace(rows=sum(one.rows for one in kept), ingests=tuple(kept)))
+    complete = name == RECORDINGS or sum(file.rows for file in found) == rows
+    return found if complete else []
 
 
-def _find_lost(
-    place: Location, readable: Files, damaged: Mapping[str, Collection[str]]
-) -> dict[str, dict[tuple[str, str], LostRecording]]:
-    """Return, per damaged table, the recordings that only the other table has, by their ids.
+def _find_joined_files(place: Location, name: str, path: str) -> list[str]:
+    """Return the files that were removed by the commit that added this file, from Delta's log.
+
+    The list is empty if the log no longer has that commit.
+    """
+    log = f"{name}/_delta_log"
+    commits = [one for one in place.times(log) if one.endswith(".json")]
+    for commit in sorted(commits, reverse=True):
+        with place.reading(f"{log}/{commit}") as source:
+            actions = [json.loads(line) for line in source.read().splitlines()]
+        if any(unquote(one["add"]["path"]) == path for one in actions if "add" in one):
+            return [unquote(one["remove"]["path"]) for one in actions if "remove" in one]
+    return []
+
+
+def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredFile]) -> bool:
+    """Replace a damaged file by its sources' rows; return False if it is gone from the table."""
+    made = []
+    if sources:
+        schema = pa.schema(store.path.open_table(name).schema().to_arrow())
+        kept = [one for file in sources for one in file.ingests]
+        made.append(merge(store.path, name, sources, kept, schema))
+    replaced = store.replace_files(name, {path}, made, OPERATION) is not None
+    if replaced and name == RECORDINGS and OWN_PATH.fullmatch(path):
+        store.path.delete([f"{name}/{path}"])  # readers would still find it by its path
+    return replaced
+
+
+def _find_lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
+    """Return the recordings that have rows but no manifest, or a manifest but no rows.
 
     A manifest also has no rows while its writer is between two commits. Its recording may then be
     returned, too: ingesting it again does no harm.
     """
     manifests: dict[str, dict[str, Any]] = {}
-    for file in readable[RECORDINGS] if any(damaged.values()) else ():
+    for file in readable[RECORDINGS] if dropped else ():
         rows = place.read(f"{RECORDINGS}/{file.path}", columns=_LOST_COLUMNS).to_pylist()
         held = {one.ingest_id for one in file.ingests}
         manifests |= {row["ingest_id"]: row for row in rows if row["ingest_id"] in held}
-    without_manifest: dict[tuple[str, str], LostRecording] = {}
-    for file in readable[TRANSITIONS] if damaged[RECORDINGS] else ():
-        if unlisted := [one for one in file.ingests if one.ingest_id not in manifests]:
-            sources = _source_files(place, file)
-            for one in unlisted:
-                without_manifest[one.recording_id, one.ingest_id] = LostRecording(
-                    one.recording_id, sources[one.ingest_id], one.rows, None
+    lost: dict[str, LostRecording] = {}
+    if any(path.startswith(f"{RECORDINGS}/") for path in dropped):
+        for file in readable[TRANSITIONS]:
+            if unlisted := [one for one in file.ingests if one.ingest_id not in manifests]:
+                sources = _source_files(place, file)
+                for one in unlisted:
+                    lost[one.recording_id] = LostRecording(
+                        one.recording_id, sources[one.ingest_id], one.rows, None
+                    )
+    if any(path.startswith(f"{TRANSITIONS}/") for path in dropped):
+        there = {one.recording_id for file in readable[TRANSITIONS] for one in file.ingests}
+        for row in sorted(manifests.values(), key=lambda row: row["ingested_at"]):
+            if (recording := row["recording_id"]) not in there:
+                corrections = len(row.get("corrections") or ())
+                lost[recording] = LostRecording(
+                    recording, row["source_file"], row["transitions"], corrections
                 )
-    there = {one.recording_id for file in readable[TRANSITIONS] for one in file.ingests}
-    newest = {
-        row["recording_id"]: row
-        for row in sorted(manifests.values(), key=lambda row: row["ingested_at"])
-        if row["recording_id"] not in there
-    }
-    without_rows = {
-        (recording, row["ingest_id"]): LostRecording(
-            recording, row["source_file"], row["transitions"], len(row.get("corrections") or ())
-        )
-        for recording, row in newest.items()
-        if damaged[TRANSITIONS]
-    }
-    return {TRANSITIONS: without_rows, RECORDINGS: without_manifest}
+    return sorted(lost.values(), key=lambda one: (one.source_file, one.recording_id))
 
 
 def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
@@ -288,3 +326,7 @@ def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
     names = ["ingest_id", "source_file"]
     rows = place.read(f"{TRANSITIONS}/{file.path}", columns=names)
     return dict(zip(*(rows[name].to_pylist() for name in names), strict=True))
+
+
+def _in_table(name: str, paths: Sequence[str] | Mapping[str, object]) -> list[str]:
+    return [f"{name}/{path}" for path in paths]

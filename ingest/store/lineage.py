@@ -136,6 +136,15 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
     return [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
 
 
+def read_stored_file(place: Location, name: str, path: str) -> StoredFile:
+    """Read which ingests an active or removed file of a table has. Raises as `stored_files`."""
+    with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
+        rows = open_parquet(source).metadata.num_rows
+    if own := _parse_own_path(path, rows):
+        return StoredFile(path, rows, 0, 0, own)
+    return StoredFile(path, rows, 0, 0, *_read(place, name, path))
+
+
 @contextmanager
 def damage_named(place: Location, path: str) -> Iterator[None]:
     """Turn errors of reading a file of the store into a StoreError that names the file."""

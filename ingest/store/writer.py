@@ -448,11 +448,8 @@ def fold(store: StoreWriter, changed: Collection[str] = (), *, small: bool = Fal
             store.path, RECORDINGS, plan.chosen, plain, schema, extra=extra, summarised=True
         )
         paths = {file.path for file in plan.chosen}
-        try:
-            if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
-                return plan
-        finally:
-            store.discard_uncommitted(RECORDINGS, [one])
+        if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
+            return plan
     raise StoreError(
         f"other writers were faster {ATTEMPTS} times",
         where=str(store.path),
@@ -598,10 +595,7 @@ def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted
     schema = pa.schema(store.path.open_table(TRANSITIONS).schema().to_arrow())
     made = merge(store.path, TRANSITIONS, group, list(held.values()), schema, summarised=True)
     paths = {file.path for file in group}
-    try:
-        version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
-    finally:
-        store.discard_uncommitted(TRANSITIONS, [made])
+    version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
     if version is None:
         done.changed_meanwhile += len(group)
         return

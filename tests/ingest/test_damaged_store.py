@@ -63,24 +63,26 @@ def write_compacted(place: Path | str) -> StoreWriter:
 UNDAMAGED_ROWS = expected((1, "a", 0), (2, "b", 7), (3, "a", 0))
 
 
-@pytest.mark.parametrize("how", one_in(2, DAMAGES))
-@pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
-def test_own_files_replace_damaged_joined_file(tmp_path, name, how):
+@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize(
+    "names", one_in(3, [[TRANSITIONS, RECORDINGS], [TRANSITIONS], [RECORDINGS]])
+)
+def test_damaged_compacted_file_is_rebuilt_from_sources(tmp_path, names, how):
     writer = write_compacted(tmp_path / "s")
     before = writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist()
-    damaged = next(file for file in active_files(tmp_path / "s", name) if "compacted" in file)
-    damage(tmp_path / "s", damaged, how)
+    damaged = [
+        file for name in names for file in active_files(tmp_path / "s", name) if "compacted" in file
+    ]
+    for file in damaged:
+        damage(tmp_path / "s", file, how)
     planned = drop_damaged(writer, dry_run=True)
     result = drop_damaged(writer)
     assert planned == result
-    restored = [f"{name}/{n:016x}/{n:016x}-a.parquet" for n in (1, 3)]
-    assert (result.dropped, sorted(result.restored), result.lost) == ([damaged], restored, [])
+    assert (result.joined_again, result.dropped, result.lost) == (damaged, [], [])
     assert shown(tmp_path / "s") == UNDAMAGED_ROWS
     assert writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist() == before
     assert len(writer.live()) == 3
-    assert drop_damaged(writer).dropped == []
-    compact(writer)
-    assert shown(tmp_path / "s") == UNDAMAGED_ROWS
+    assert drop_damaged(writer).joined_again == []
 
 
 @pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
@@ -88,7 +90,7 @@ def test_own_files_replace_damaged_joined_file(tmp_path, name, how):
 @pytest.mark.parametrize("how", one_in(2, DAMAGES[:2]))
 def test_lost_recordings_are_listed_and_can_be_reingested(place, name, how):
     writer = write_compacted(place)
-    writer.clean(retention_hours=0)  # removes the files that were joined
+    writer.clean(retention_hours=0)  # removes the source files of the compacted file
     damage(place, next(file for file in active_files(place, name) if "compacted" in file), how)
     with pytest.raises(StoreError, match=r"restock store compact .* --drop-damaged"):
         StoreWriter(place).write(*one(1, "c"))
@@ -109,11 +111,11 @@ def test_lost_recordings_are_listed_and_can_be_reingested(place, name, how):
 def test_rows_of_replaced_ingest_are_not_restored(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1))
-    writer.write(*one(1, "b"))
+    writer.write(*one(1, "b"))  # with the same number of rows
     (file,) = active_files(tmp_path / "s", TRANSITIONS)
     damage(tmp_path / "s", file, "cut")
     result = drop_damaged(writer)
-    assert (result.restored, result.dropped) == ([], [file])
+    assert (result.joined_again, result.dropped) == ([], [file])
     assert [loss.recording_id for loss in result.lost] == [f"{1:016x}"]
     assert shown(tmp_path / "s") == {}
 
@@ -195,16 +197,19 @@ def test_rows_with_changed_bytes_are_never_used(tmp_path, shell):
     assert shown(place) == expected((2, "a", 0))
 
 
-def test_concurrent_repairs_of_one_file_agree(tmp_path, before_commit):
+def test_concurrent_drops_of_one_file_drop_it_once(tmp_path, before_commit):
     writer = write_compacted(tmp_path / "s")
     file = next(path for path in active_files(tmp_path / "s", TRANSITIONS) if "compacted" in path)
     damage(tmp_path / "s", file, "cut")
 
-    results = []
-    before_commit(lambda: results.append(drop_damaged(StoreWriter(tmp_path / "s"))))
-    assert drop_damaged(writer) == results[0]
-    assert (results[0].dropped, results[0].lost) == ([file], [])
+    def drop_concurrently():
+        assert drop_damaged(StoreWriter(tmp_path / "s")).joined_again == [file]
+
+    before_commit(drop_concurrently)
+    result = drop_damaged(writer)
+    assert (result.joined_again, result.dropped, result.lost) == ([], [], [])
     assert shown(tmp_path / "s") == UNDAMAGED_ROWS
+    assert len([path for path in files_of(tmp_path / "s") if "transitions/compacted" in path]) == 3
 
 
 def test_clean_and_fold_survive_a_damaged_manifest(writer, tmp_path, monkeypatch):

@@ -37,12 +37,12 @@ class CompactCommand:
     dry_run: bool = False
     """Print what would be done; write nothing."""
     drop_damaged: bool = False
-    """Only repair: read every file of the store, and take damaged ones out of it. Use the files
-    again that a damaged one was joined from, while they are kept; name the recordings that must be
+    """Only repair: read every file of the store, join damaged ones again from the files they were
+    made of, or if those are gone, take them out of the store and name the recordings that must be
     ingested again (exit code 3)."""
     json: bool = False
     """Print one JSON document: {"rows", "files_before", "files_after", …}, or with --drop-damaged
-    {"dropped", "restored", "lost", "unnamed_transitions"}."""
+    {"joined_again", "dropped", "lost", "unnamed_transitions"}."""
 
     def run(self) -> ExitCode:
         """Join the files, and print how many there were and are."""
@@ -91,11 +91,10 @@ class CompactCommand:
         if self.json:
             output.print_json(asdict(done))
         would = "would be " if self.dry_run else ""
-        for file in done.dropped:
-            output.say(f"{self.store}: {file} is damaged: {would}dropped")
-        if done.restored:
-            output.say(f"{would}used again: {counted(len(done.restored), 'file')} joined in them")
-        if not done.dropped:
+        for files, what in ((done.joined_again, "joined again"), (done.dropped, "dropped")):
+            for file in files:
+                output.say(f"{self.store}: {file} is damaged: {would}{what}")
+        if not done.joined_again + done.dropped:
             output.say(f"{self.store}: no file is damaged")
         for one in done.lost:
             corrections = f", {counted(one.corrections, 'correction')}" if one.corrections else ""
@@ -106,7 +105,7 @@ class CompactCommand:
         if done.unnamed_transitions:
             unnamed = counted(done.unnamed_transitions, "transition")
             output.say(f"{unnamed} more belonged to recordings that no manifest names")
-        return ExitCode.LOSSY if done.lost or done.unnamed_transitions else ExitCode.OK
+        return ExitCode.LOSSY if done.dropped else ExitCode.OK
 
 
 SHOWN = 3  # recordings to name in the command that ingests them again
