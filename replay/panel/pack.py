@@ -1,9 +1,9 @@
 """Pack a plan's rows into a file of float32 rows and a table of metadata, in bounded memory.
 
-For a store of any size, memory holds only the plan, a batch and some blocks of packed rows.
+For a store of any size, memory holds only the plan and a batch.
 Observations are read in the order of the files and written to their places, because sorting such
 wide rows would spill all of them to disk first. The rows of a recording are adjacent in both
-orders, so a block is soon full. Other threads write full blocks while the next ones are filled.
+orders, so each batch is written to few parts of the file.
 
 An n-step return of step t uses the rewards of [t, t + n) and bootstraps from the state at t + n. It
 is cut where the episode ends, where a step is missing, and before an off-policy action: the action
@@ -20,14 +20,12 @@ bias (it is the cut of Watkins's Q(lambda), 1989). It never depends on a reward 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Any, NamedTuple
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -45,142 +43,50 @@ from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.packed_rows import row_columns, row_width
 
-BLOCK_ROWS = 512  # packed rows that are written together
-HELD_BYTES = 128 << 20  # largest size of unfinished blocks in memory
-WRITERS = 2  # threads that write blocks
-WAITING_BYTES = 32 << 20  # largest size of full blocks that wait to be written
-
-
-class Values(NamedTuple):
-    """Values of some columns for rows (m,)."""
-
-    columns: slice
-    held: NDArray[Any]  # (m, c), one entry per row; with `of`, (n, c) in any order
-    of: Ints | None = None  # (m,) index of each row's entry in `held`
-
 
 class PackedFile:
     """Writes a file of rows (n, W) float32 from parts of rows, each put once, in any order.
 
-    Blocks are written when they are full. Unfinished blocks stay in memory; if there are too many,
-    the oldest are written and later read back. Use the object as a context manager: it waits for
-    pending writes at the end.
+    Each `put` maps only the part of the file that it writes, so memory does not grow with the file.
+
+    Raises:
+        OSError: the disk has too little space for the file.
     """
 
     def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
-        self._rows, self._width, self._parts = rows, width, parts
-        self._path = path
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # block -> number of parts put
-        self._held: dict[int, F32] = {}
-        self._writers = ThreadPoolExecutor(WRITERS, "restock-pack")
-        self._writing: dict[int, Future[None]] = {}  # block -> its pending write
+        self._path, self._width = path, width
+        self._missing = rows * parts
+        with path.open("wb") as file:
+            if (
+                rows
+            ):  # reserve the space: if the disk were full later, a signal would end the process
+                os.posix_fallocate(file.fileno(), 0, 4 * rows * width)
 
-    def __enter__(self) -> PackedFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._writers.shutdown(cancel_futures=True)
-        os.close(self._file)
+    def put(self, rows: Ints, *values: tuple[slice, NDArray[Any]]) -> None:
+        """Set some columns of rows (m,); each value has the columns and their content, (m, c)."""
+        if not len(rows):
+            return
+        first, last = int(rows.min()), int(rows.max())
+        packed = np.memmap(
+            self._path,
+            "<f4",
+            "r+",
+            offset=4 * first * self._width,
+            shape=(last - first + 1, self._width),
+        )
+        for columns, content in values:
+            packed[rows - first, columns] = content
+        self._missing -= len(rows)
 
     def finish(self) -> FileRecord:
-        """Wait for pending writes; return the size and checksums of the file.
+        """Return the size and checksums of the file.
 
         Raises:
             PanelError: a part of a row is missing.
         """
-        self._wait(at_most=0)
-        if int(self._put.sum()) != self._rows * self._parts:
+        if self._missing:
             raise PanelError("the source changed while it was read", where=str(self._path.parent))
         return FileRecord.of(self._path)
-
-    def put(self, rows: Ints, *values: Values) -> None:
-        """Set some columns of rows (m,).
-
-        Raises OSError if the file cannot be written.
-        """
-        if (np.diff(rows) < 0).any():
-            order = np.argsort(rows, kind="stable")
-            rows = rows[order]
-            values = tuple(
-                value._replace(of=order if value.of is None else value.of[order])
-                for value in values
-            )
-        block = rows // BLOCK_ROWS
-        into = _RowRanges(rows)
-        out_of = [None if value.of is None else _RowRanges(value.of) for value in values]
-        for begin, end in itertools.pairwise([0, *np.flatnonzero(np.diff(block)) + 1, len(rows)]):
-            if begin == end:
-                continue
-            number = int(block[begin])
-            packed = self._block(number)
-            to = into(begin, end, number * BLOCK_ROWS)
-            for value, of in zip(values, out_of, strict=True):
-                held = slice(begin, end) if of is None else of(begin, end)
-                packed[to, value.columns] = value.held[held]
-            self._put[number] += end - begin
-            if self._put[number] == len(packed) * self._parts:
-                self._write(number)
-        while len(self._held) * self._block_bytes > HELD_BYTES:
-            self._write(next(iter(self._held)))
-
-    @property
-    def _block_bytes(self) -> int:
-        return 4 * BLOCK_ROWS * self._width
-
-    def _block(self, number: int) -> F32:
-        if (held := self._held.get(number)) is None:
-            count = min(BLOCK_ROWS, self._rows - number * BLOCK_ROWS)
-            held = np.empty((count, self._width), "<f4")
-            if self._put[number]:
-                if (writing := self._writing.pop(number, None)) is not None:
-                    writing.result()
-                if not _read_into(held, self._file, number * self._block_bytes):
-                    raise PanelError("its written files are gone", where=str(self._path))
-            self._held[number] = held
-        return held
-
-    def _write(self, number: int) -> None:
-        held = self._held.pop(number)
-        self._wait(at_most=max(WAITING_BYTES // self._block_bytes, WRITERS))
-        self._writing[number] = self._writers.submit(self._store, number, held)
-
-    def _wait(self, at_most: int) -> None:
-        """Wait until at most `at_most` writes are pending; raise errors of finished writes."""
-        while len(self._writing) > at_most:
-            self._writing.pop(next(iter(self._writing))).result()
-
-    def _store(self, number: int, held: F32) -> None:
-        rest, place = held.data.cast("B"), number * self._block_bytes
-        while rest:  # pwrite may write only a part; a full disk raises OSError
-            written = os.pwrite(self._file, rest, place)
-            rest, place = rest[written:], place + written
-
-
-def _read_into(out: F32, file: int, at: int) -> bool:
-    """Fill `out` with the file's bytes from offset `at`; return False if the file is too short."""
-    rest = out.data.cast("B")
-    while rest:
-        got = os.preadv(file, [rest], at)
-        if got <= 0:
-            return False
-        rest, at = rest[got:], at + got
-    return True
-
-
-class _RowRanges:
-    """Ranges of row numbers (m,), as slices if the numbers are consecutive: slices copy faster."""
-
-    def __init__(self, rows: Ints) -> None:
-        self._rows = rows
-        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # breaks up to each row
-
-    def __call__(self, begin: int, end: int, base: int = 0) -> Ints | slice:
-        """Return the row numbers from index `begin` to `end`, minus `base`."""
-        if self._breaks[begin] != self._breaks[end - 1]:
-            return self._rows[begin:end] - base
-        first = int(self._rows[begin]) - base
-        return slice(first, first + end - begin)
 
 
 ROW_GROUP_ROWS = 65_536
@@ -310,15 +216,13 @@ class Packer:
         query = f"SELECT {names} {of_task}"
         places = Places(self._ids)
         # A row has two parts: observation, action and reward; next observation and discount.
-        with (
-            PackedFile(path, len(self.chosen), row_width(size), parts=2) as rows,
-            any_order(self.connection),  # allowed, as a row's place follows from its id
-        ):
+        rows = PackedFile(path, len(self.chosen), row_width(size), parts=2)
+        with any_order(self.connection):  # allowed, as a row's place follows from its id
             for batch in filter(len, self.connection.sql(query).to_arrow_reader(at_a_time)):
                 place = places.of(batch.column("transition_id").to_numpy())
                 self._write(rows, size, batch, place)
                 advance(len(batch))
-            return size, rows.finish()
+        return size, rows.finish()
 
     def _write(self, rows: PackedFile, size: int, batch: pa.RecordBatch, place: Ints) -> None:
         """Write a batch's values to the packed rows that use them."""
@@ -336,9 +240,9 @@ class Packer:
             returns[reach] += self.mixture.discount**ahead * reward
         rows.put(
             target,
-            Values(part["observation"], observation, packed),
-            Values(part["action"], batch.column("action").to_numpy()[:, None], packed),
-            Values(part["reward"], returns[:, None], packed),
+            (part["observation"], observation[packed]),
+            (part["action"], batch.column("action").to_numpy()[packed, None]),
+            (part["reward"], returns[packed, None]),
         )
         # A row's next observation completes the packed rows whose return ends with that row.
         first, behind = _find_ranges(self.last, place)
@@ -351,8 +255,8 @@ class Packer:
         discount = (self.mixture.discount**spanned * not_terminated[source])[:, None]
         rows.put(
             ends,
-            Values(part["next_observation"], next_observation, source),
-            Values(part["discount"], discount),
+            (part["next_observation"], next_observation[source]),
+            (part["discount"], discount),
         )
         if not (
             _is_finite(observation, packed)

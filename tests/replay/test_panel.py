@@ -25,7 +25,7 @@ from restock.replay.panel import panel as panel_module
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import ROWS, Panel
 from restock.replay.plan import candidates
-from restock.replay.sampling.packed_rows import PACKING_VERSION, row_width
+from restock.replay.sampling.packed_rows import PACKING_VERSION
 from restock.replay.store.store import Store
 
 
@@ -125,9 +125,6 @@ def test_small_batches_pack_same_bytes(tmp_path, monkeypatch, whole_file):
         (candidates, "BATCH_ROWS", 2048),
         (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
         (pack, "ROW_GROUP_ROWS", 1000),
-        (pack, "BLOCK_ROWS", 64),
-        (pack, "WAITING_BYTES", 0),
-        (pack, "HELD_BYTES", 3 * 64 * row_width(TASK.observation_size) * 4),
     ):
         monkeypatch.setattr(module, name, value)
     by_parts = build_panel(table, mixture, tmp_path / "b", task=TASK)
