@@ -173,12 +173,7 @@ _LEFT_OUT = (
 )
 
 
-@dataclass(frozen=True)
-class StoreVersion:
-    """A store in which a transition is looked up, and its version (None: the newest)."""
-
-    path: str
-    version: int | None = None
+StoreVersion = tuple[str, int | None]  # path of a store, and its version (None: the newest)
 
 
 @dataclass
@@ -212,34 +207,34 @@ def find_origin(
         StoreError: a store does not exist, or no store has the row.
         RecordingError: `recording` is not the row's recording.
     """
-    for source in sources:
-        if not is_store(source.path):
+    for path, version in sources:
+        if not is_store(path):
             raise StoreError(
                 "the store does not exist (any more)",
-                where=source.path,
+                where=path,
                 remedy=f"trace the row where the store is now: `restock trace STORE {transition}`",
             )
-        origin = _look_up(source, transition)
+        origin = _look_up(path, version, transition)
         if origin is not None:
             _interpret(origin, recording)
             return origin
     raise StoreError(
         f"no transition {transition} in it",
-        where=", ".join(source.path for source in sources),
+        where=", ".join(path for path, _ in sources),
         remedy="its recording was removed, or ingested again with other steps: `restock sql STORE"
         ' "FROM recordings"` lists what is there',
     )
 
 
-def _look_up(source: StoreVersion, transition: int) -> Origin | None:
-    """Return the row at the source's version, or at the newest if that cannot be read any more."""
-    now = _read(StoreVersion(source.path), transition)
-    if source.version is None:
+def _look_up(path: str, version: int | None, transition: int) -> Origin | None:
+    """Return the row at a version, or at the newest if that version cannot be read any more."""
+    now = _read(path, None, transition)
+    if version is None:
         return now
-    then = _read(source, transition)
+    then = _read(path, version, transition)
     if then is None and now is not None:
         now.notes.append(
-            f"version {source.version} of the store can no longer be read: this is the row of "
+            f"version {version} of the store can no longer be read: this is the row of "
             f"version {now.store['version']}"
         )
         return now
@@ -249,10 +244,10 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
     return then
 
 
-def _read(source: StoreVersion, transition: int) -> Origin | None:
+def _read(path: str, version: int | None, transition: int) -> Origin | None:
     """Read a row with its manifest, frames and reward; None if the row or version is gone."""
     try:
-        with Store(source.path, version=source.version) as store:
+        with Store(path, version=version) as store:
             rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
             if not rows:
                 return None
@@ -264,16 +259,16 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
                 r["step_index"]: r
                 for r in rows_of(store.connection, sql_file("trace_around.sql"), around)
             }
-            version = store.version
+            opened = store.version
             manifest = manifests[0] if manifests else None
-            frames, lost = _frames(store, source.path, row, manifest)
+            frames, lost = _frames(store, path, row, manifest)
     except (duckdb.IOException, StoreError):
-        if source.version is None or was_interrupted():
+        if version is None or was_interrupted():
             raise
         return None
     origin = Origin(
         transition=row,
-        store={"path": source.path, "version": version},
+        store={"path": path, "version": opened},
         moment=_moment(row, manifest),
         recording=manifest,
         frames=frames,
@@ -317,22 +312,9 @@ def _frames(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return the rows of a query as dicts.
-
-    Raises:
-        StoreError: the file that it reads (its parameter `file`) is damaged.
-    """
-    try:
-        relation = connection.sql(sql, params=dict(parameters))
-        return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
-    except duckdb.Error as error:
-        if (file := parameters.get("file")) is None:
-            raise
-        raise StoreError(
-            f"is damaged or cannot be read: {first_line(error)}",
-            where=str(file),
-            remedy="restore the file from a copy, or train the run again",
-        ) from error
+    """Return the rows of a query as dicts."""
+    relation = connection.sql(sql, params=dict(parameters))
+    return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
 
 
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:

@@ -65,7 +65,7 @@ def trace_row(place: str | Path, row: str | int, *, recording: Path | str | None
         if location.version is not None:
             with Store(location) as store:
                 version = store.version
-        trace.origin = _origin([StoreVersion(str(location), version)], number, recording)
+        trace.origin = find_origin([(str(location), version)], number, recording=recording)
     else:
         raise StoreError(
             "it is not a run, a panel or a store" if path.exists() else "it does not exist",
@@ -133,18 +133,14 @@ def _trace_panel_row(trace: Trace, panel: Panel, number: int, recording: Path | 
     if header.store_version < 0:
         trace.notes.append("the panel was made from a table in memory: there is no store to search")
         return
-    sources = [StoreVersion(header.store, header.store_version)]
-    sources += [StoreVersion(other.path, other.version) for other in header.others]
-    trace.origin = _origin(sources, int(meta["transition_id"]), recording)
+    sources: list[StoreVersion] = [(header.store, header.store_version)]
+    sources += [(other.path, other.version) for other in header.others]
+    trace.origin = find_origin(sources, int(meta["transition_id"]), recording=recording)
     stored = np.float32(trace.origin.transition["observation"])
     same = np.array_equal(packed[panel.columns["observation"]], stored)
     trace.panel["same_observation_as_stored"] = same
     if not same:
         trace.notes.append("the observation in the store is not the one that was packed")
-
-
-def _origin(sources: list[StoreVersion], transition: int, recording: Path | str | None) -> Origin:
-    return find_origin(sources, transition, recording=recording)
 
 
 def _add_twin_episode(
