@@ -211,6 +211,8 @@ def novel_rows(store: Store) -> dict[str, Any]:
 
 def explain_novel_rows(found: Mapping[str, Any]) -> str:
     """Return a sentence that explains the result of `novel_rows`."""
+    if not found["rows_held"]:
+        return "No row has a novelty: that needs some rows of other episodes to compare it with."
     return (
         f"Novel rows are the {NOVEL_SHARE:.0%} whose observations are furthest from those of other"
         f" episodes: in {found['nominal_rows']:,} of {found['rows_held']:,}, no condition holds."

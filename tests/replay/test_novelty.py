@@ -226,3 +226,10 @@ def test_coverage_page_lists_most_novel_rows(sample, tmp_path):
     assert '<section id="strangest">' in text
     assert all(row["row"] in text for row in (first, *others))
     assert cli.main(["trace", str(sample), first["row"]]) == 0
+
+
+def test_rows_of_one_episode_have_no_novelty(tmp_path, shell):
+    rows = recording_transitions(1, episodes=1)
+    store = write_store(tmp_path / "store", [rows])
+    assert "No row has a novelty" in shell.out("coverage", store)
+    assert len(rows) > NEAREST
