@@ -27,9 +27,8 @@ CREATE OR REPLACE MACRO student_quantile(df) AS
 
 -- All comparisons. `every` is the length of a period, as a date_trunc unit (day, week, month, year, decade). A
 -- robot's later periods of a signal are compared with its first `reference` periods. Fewer than `least_episodes`
--- episodes on either side are too few. Without `sizes`, cliffs_delta and ks_distance, which need a sort of all
--- values, are null.
-CREATE OR REPLACE MACRO drift_by(every := 'week', reference := 2, least_episodes := 5, sizes := true) AS TABLE
+-- episodes on either side are too few.
+CREATE OR REPLACE MACRO drift_by(every := 'week', reference := 2, least_episodes := 5) AS TABLE
 WITH valued AS (
     SELECT
         signal,
@@ -324,36 +323,6 @@ WITH valued AS (
         ) AS apart_error
     FROM judged
     WINDOW site AS (PARTITION BY against, site, part, signal, zone, period)
-), places AS ( -- rank of each value among the values of its period, and among those of the reference
-    SELECT
-        *,
-        count(*) OVER (PARTITION BY robot, signal, period) AS n,
-        count(*) FILTER (is_reference) OVER (PARTITION BY robot, signal) AS n_reference,
-        count(*) OVER below AS place,
-        count(*) OVER (below RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW EXCLUDE GROUP) AS place_before,
-        count(*) FILTER (is_reference) OVER below_all AS among,
-        count(*) FILTER (is_reference) OVER (
-            below_all RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW EXCLUDE GROUP
-        ) AS among_before
-    FROM (SELECT robot, signal, period, x FROM valued WHERE sizes)
-    JOIN periods USING (robot, signal, period)
-    WINDOW
-        below AS (PARTITION BY robot, signal, period ORDER BY x),
-        below_all AS (PARTITION BY robot, signal ORDER BY x)
-), distances AS (
-    SELECT
-        'own reference' AS against,
-        robot,
-        signal,
-        period,
-        2 * sum((among + among_before) / 2) / (any_value(n) * any_value(n_reference)) - 1 AS cliffs_delta,
-        -- The two distributions are furthest apart at one of the period's values, or just before it.
-        max(greatest(
-            abs(place / n - among / n_reference), abs(place_before / n - among_before / n_reference)
-        )) AS ks_distance
-    FROM places
-    WHERE NOT is_reference AND n_reference > 0
-    GROUP BY robot, signal, period
 )
 SELECT
     robot,
@@ -384,8 +353,6 @@ SELECT
     CASE compared WHEN 'ratio' THEN exp(difference + half) ELSE difference + half END AS change_high,
     matters,
     size,
-    cliffs_delta,
-    ks_distance,
     p,
     q,
     samples,
@@ -395,7 +362,6 @@ SELECT
     CASE WHEN difference > 0 THEN risen ELSE fallen END - CAST(verdict = 'changed' AS INTEGER)
         AS others_changed
 FROM beside
-LEFT JOIN distances USING (against, robot, signal, period)
 ORDER BY robot, against DESC, part, signal, zone NULLS FIRST, period;
 
 CREATE OR REPLACE VIEW drift AS FROM drift_by();

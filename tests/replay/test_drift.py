@@ -91,7 +91,7 @@ def test_student_t_matches_scipy(df):
         assert quantile == pytest.approx(stats.t.ppf(0.975, df), rel=2e-3)
 
 
-def test_statistic_and_effect_sizes_match_scipy():
+def test_trimmed_test_matches_scipy():
     rng = np.random.default_rng(3)
     early, late = rng.normal(0, 1, 24), rng.normal(0.9, 1, 31)
     table = samples({("a", "x", 0): [early], ("a", "x", 1): [late]})
@@ -100,9 +100,6 @@ def test_statistic_and_effect_sizes_match_scipy():
     low, high = trimmed.confidence_interval()
     assert row["p"] == pytest.approx(trimmed.pvalue, rel=1e-6)
     assert [row["change_low"], row["change_high"]] == pytest.approx([low, high], rel=1e-3)
-    wins = stats.mannwhitneyu(late, early).statistic / (len(late) * len(early))
-    assert row["cliffs_delta"] == pytest.approx(2 * wins - 1)
-    assert row["ks_distance"] == pytest.approx(stats.ks_2samp(late, early).statistic)
     assert (row["n"], row["n_reference"], row["samples"]) == (31, 24, "episodes")
 
 
