@@ -397,7 +397,7 @@ def install_gaps(store: Store) -> None:
     can drive.)
     """
     script = files("restock.replay.fleet") / "gaps.sql"
-    install_planned(store, ("gaps",), {"planned_gaps": (COLUMNS, _gaps_table)}, script, _plan_list)
+    install_planned(store, {"planned_gaps": (COLUMNS, _gaps_table)}, script, _plan_list)
 
 
 def _plan_list(own: Store, name: str) -> ShoppingList:

@@ -7,8 +7,7 @@ the store again, because a running query cannot use its own connection.
 from __future__ import annotations
 
 import functools
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -63,7 +62,7 @@ def install_mixtures(store: Store) -> None:
     """Create the macros `mixture(name)` and `mixture_rows(name)` in a store's connection."""
     tables = {"planned_strata": (STRATA, strata_table), "planned_rows": (ROWS, rows_table)}
     script = files("restock.replay.panel") / "mixture_tables.sql"
-    install_planned(store, ("mixture", "mixture_rows"), tables, script, _plan)
+    install_planned(store, tables, script, _plan)
 
 
 def _plan(own: Store, name: str) -> PanelPlan:
@@ -77,7 +76,6 @@ def _plan(own: Store, name: str) -> PanelPlan:
 
 def install_planned(
     store: Store,
-    macros: Sequence[str],
     tables: Mapping[str, tuple[dict[str, str], Callable[[T], pa.Table]]],
     script: Traversable,
     plan: Callable[[Store, str], T],
@@ -85,7 +83,6 @@ def install_planned(
     """Create table macros in a store's connection that return rows of a plan, made in Python.
 
     Args:
-        macros: names of the macros; each takes the name of a mixture.
         tables: name of a SQL function -> its columns, and a function from a plan to its table.
         script: the SQL that creates the macros, which call the functions of `tables`.
         plan: plans a mixture; its arguments are another `Store` of the same version, and the name.
@@ -100,19 +97,7 @@ def install_planned(
 
     for function, (columns, table_of) in tables.items():
         _install_function(store.bare, function, columns, table_of, planned)
-    store.checks.append(functools.partial(_check_names, macros))
     store.bare.execute(script.read_text(encoding="utf-8"))
-
-
-def _check_names(macros: Sequence[str], text: str) -> None:
-    """Raise ConfigError if a query calls one of these macros with a mixture that cannot be read.
-
-    Otherwise the error would only appear when rows are fetched, inside an error of DuckDB.
-    """
-    from restock.replay.mixture.mixture import load_mixture
-
-    for name in re.findall(rf"\b(?:{'|'.join(macros)})\s*\(\s*'([^']*)'\s*\)", text, re.IGNORECASE):
-        load_mixture(name)
 
 
 def _install_function(

@@ -152,8 +152,6 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
-        # Called with each query's text before it runs, to report errors before rows are fetched.
-        self.checks: list[Callable[[str], None]] = []
         summaries = self._has_summaries()
         self._definitions = Definitions(
             self.bare,
@@ -225,8 +223,6 @@ class Store:
         try:
             with self._query_lock:
                 self._definitions.make(text)
-                for check in self.checks:
-                    check(text)
                 return query(self.bare, text, where=str(self.path))
         except (duckdb.Error, QueryError) as error:
             if "connection is busy" not in str(error):
