@@ -33,7 +33,6 @@ from restock.errors import ConfigError
 from restock.ingest.profile.tables import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
-    COMMAND_THROUGH,
     FALLBACKS,
     FIX_FALLBACK,
     HINDSIGHT,
@@ -98,9 +97,6 @@ class Profile(Checked, frozen=True, dict=True):
     behaviour_policy: str = "unknown"  # who drives, if no topic says so
     # Possible driver (a person, navigation) -> its own commands, before one driver is chosen.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
-    # Topic of the chosen driver's commands, if the robot smooths or limits them afterwards. The
-    # driver is then the one of `command_sources` whose command this topic repeats.
-    command_through: Input | None = None
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
@@ -168,9 +164,9 @@ class Profile(Checked, frozen=True, dict=True):
 
     @property
     def sources(self) -> dict[str, Input]:
-        """Return all inputs by name, including `command_sources.NAME` and `command_through`.
+        """Return all inputs by name, including `command_sources.NAME`.
 
-        Those two are optional, and so are goal and plan if the task has no goal.
+        Sources of commands are optional, and so are goal and plan if the task has no goal.
         """
         optional = {
             name: msgspec.structs.replace(source, optional=True)
@@ -181,8 +177,6 @@ class Profile(Checked, frozen=True, dict=True):
             f"{COMMAND_SOURCES}.{name}": msgspec.structs.replace(source, optional=True)
             for name, source in self.command_sources.items()
         }
-        if self.command_through is not None:
-            optional[COMMAND_THROUGH] = msgspec.structs.replace(self.command_through, optional=True)
         return dict(self.inputs.items()) | optional
 
     @property
@@ -206,8 +200,6 @@ class Profile(Checked, frozen=True, dict=True):
                 fallbacks[f"{name}.yaw_rate_radps"] = how
         if self.command_sources and "behaviour_policy" in fallbacks:
             names = ", ".join(self.command_sources)
-            if (through := self.command_through) is not None:
-                names += f" (the one that {through.topic} repeats, which the command follows)"
             fallbacks["behaviour_policy"] = POLICY_FALLBACK.format(names=names)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
@@ -413,16 +405,6 @@ def check_profile(profile: Profile, where: str) -> None:
         )
     for name, source in profile.command_sources.items():
         check_command_source(f"{COMMAND_SOURCES}.{name}", source, profile.inputs.command, where)
-    if profile.command_through is not None:
-        if not profile.command_sources:
-            raise ConfigError(
-                "`command_through` is given without `command_sources`",
-                where=where,
-                remedy="give the topics among which it chooses, or leave it out",
-            )
-        check_command_source(
-            COMMAND_THROUGH, profile.command_through, profile.inputs.command, where
-        )
     pose = profile.inputs.pose
     if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
         raise ConfigError(

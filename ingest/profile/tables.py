@@ -262,7 +262,6 @@ def _reserved() -> set[str]:
 
 
 COMMAND_SOURCES = "command_sources"
-COMMAND_THROUGH = "command_through"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 SCAN_OF_CLOUD = {
     "ranges_m": "ranges",
@@ -581,8 +580,7 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
         )
     _check_units(key, source, where)
     complete = "speed_mps" in commanding and len(commanding) == len(source.fields) == 2
-    by_button = key != COMMAND_THROUGH and source.fields.keys() == {"pressed"}
-    if not (complete or by_button):
+    if not (complete or source.fields.keys() == {"pressed"}):
         raise ConfigError(
             f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not show when this "
             "source drives",

@@ -18,7 +18,6 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of, factor_of, plain
 from restock.ingest.profile.tables import (
     COMMAND_SOURCES,
-    COMMAND_THROUGH,
     FALLBACKS,
     POSE_FALLBACK,
     Input,
@@ -125,17 +124,12 @@ class AlignedInputs:
 
         The source of a command is the one whose own last command up to then is equal to it. If
         several are, it is the one that sent its command last; if none is, one whose button is
-        pressed. A smoothed command equals no source's command, so its source is that of the last
-        message of `command_through` before it.
+        pressed.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
-        through = self.profile.command_through
-        chosen = "command" if through is None else COMMAND_THROUGH
-        if chosen not in self.inputs.by_name:  # `command_through` was not recorded
-            return [None] * len(self.latest("command").row)
-        topic = self.inputs.by_name[chosen].topic
+        topic = self.profile.inputs.command.topic
         by = np.full(len(topics[topic]), None, object)
-        command = np.stack([self.inputs.numbers(chosen, key) for key in keys])
+        command = np.stack([self.inputs.numbers("command", key) for key in keys])
         sources = [
             (name.removeprefix(f"{COMMAND_SOURCES}."), name, source)
             for name, source in self.inputs.by_name.items()
@@ -157,14 +151,7 @@ class AlignedInputs:
                     drives = last.fresh & same & (at_ns > latest_ns)
                     latest_ns[drives] = at_ns[drives]
                 by[given.row[drives]] = policy
-        if through is None:
-            return [by[row] for row in self.latest("command").row]
-        follows = np.full(len(topics[self.profile.inputs.command.topic]), None, object)
-        for segment in self.segments:
-            given = segment.topics[self.profile.inputs.command.topic]
-            last = segment.topics[topic].hold(given.stamp_ns, through.max_age_s)
-            follows[given.row[last.fresh]] = by[last.row[last.fresh]]
-        return [follows[row] for row in self.latest("command").row]
+        return [by[row] for row in self.latest("command").row]
 
     def poses(self) -> list[PoseSeries]:
         """Return all poses in the fixed frame, per segment."""
@@ -241,9 +228,7 @@ def _command_topics(inputs: InputColumns) -> frozenset[str]:
     """Return topics read only for commands: a command takes effect when it is received."""
     topics: dict[bool, set[str]] = {True: set(), False: set()}
     for name, source in inputs.by_name.items():
-        commands = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
-            f"{COMMAND_SOURCES}."
-        )
+        commands = name in ("command", "nav_command") or name.startswith(f"{COMMAND_SOURCES}.")
         topics[commands].add(source.topic)
     return frozenset(topics[True] - topics[False])
 

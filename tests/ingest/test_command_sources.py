@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import START_NS, Drive, columns, typed_topics, without, write_topics
+from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
 from support.ingested import ingested, proposed
 from support.profile_texts import WAREHOUSE
 
@@ -17,7 +17,7 @@ from restock.ingest.steps.episodes import steps_of
 
 TWIST = "geometry_msgs/msg/Twist"
 NAV, TELEOP, OUT, JOY = "/cmd_vel_nav", "/teleop_cmd_vel", "/cmd_vel", "/joy"
-TAKEN_OVER_S, NS = (4.0, 7.0), 10**9
+TAKEN_OVER_S = (4.0, 7.0)
 SOURCES = """
 [command_sources.navigation]
 topic = "/cmd_vel_nav"
@@ -154,61 +154,9 @@ def test_drivers_are_unknown_without_sources(plain):
     assert {policy for _, policy in driver_per_step(topics, plain + SOURCES)} == {"unknown"}
 
 
-MUX, STEP = "/chosen", np.array([0.025, 0.06])
-THROUGH = """
-[command_through]
-topic = "/chosen"
-type = "geometry_msgs/msg/Twist"
-fields = { speed_mps = "linear.x", yaw_rate_radps = "angular.z" }
-max_age_s = 0.4
-"""
-
-
-def smoothed_drive(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
-    """Return the drive with its output smoothed to 20 Hz, and times `limit` from 9 to 10 s."""
-    topics = takeover_drive()
-    chosen = topics.pop(OUT)[1]
-    reported = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
-    reported_s = (chosen.log_time_ns - START_NS) * 1e-9
-    out_s, smooth, out = np.arange(0.1, 12, 0.05) + 0.013, np.zeros(2), []
-    for at in out_s:
-        target = reported[np.searchsorted(reported_s, at, "right") - 1]
-        smooth = smooth + np.clip(target - smooth, -STEP, STEP)
-        out.append(smooth * (limit if 9 < at < 10 else 1.0))
-    topics[OUT] = (TWIST, twist_columns(out_s, *np.transpose(out)))
-    topics[MUX] = (TWIST, chosen)
-    return topics
-
-
-@pytest.mark.parametrize("limit", [1.0, 0.4])
-def test_source_is_followed_through_smoother(plain, limit):
-    """A smoothed command equals no command of any source."""
-    rows = driver_per_step(smoothed_drive(limit), plain + SOURCES + THROUGH)
-    assert len(rows) > 50
-    assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
-    assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
-
-
-def test_driver_is_unknown_while_multiplexer_is_silent(plain):
-    topics, text = smoothed_drive(), plain + SOURCES + THROUGH
-    chosen = topics[MUX][1]
-    silent = (chosen.log_time_ns >= START_NS + 8 * NS) & (chosen.log_time_ns <= START_NS + 10 * NS)
-    with_gap = topics | {MUX: (TWIST, without(chosen, ~silent))}
-    rows = driver_per_step(with_gap, text)
-    assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
-    assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
-    del topics[MUX]
-    assert {policy for _, policy in driver_per_step(topics, text)} == {"unknown"}
-
-
-CHAIN = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\nfields = {}\n"
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (CHAIN.replace("{}", "{speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}"), "without"),
-        (SOURCES + CHAIN.replace("{}", "{speed_mps = 'linear.x'}"), "does not show when this"),
         (PRESSED.replace('pressed = "buttons[4]"', 'speed_mps = "axes[1]"'), "does not show when"),
         (PRESSED.replace("pressed", "presed"), "unknown 'presed'"),
     ],
