@@ -38,7 +38,7 @@ from restock.ingest.profile.profile import Profile, parse_profile, profile_toml
 from restock.ingest.profile.tag_rules import RecordingTags, in_words, resolve_tags
 from restock.ingest.steps.cameras import OFF_CLOCK, KeptFrames, frame_rows
 from restock.ingest.steps.episodes import Steps, explain_no_transitions, split, steps_of
-from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs, unknown_directions
+from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
 from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (
     LabelScore,
@@ -374,7 +374,6 @@ class _Ingest:
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *self.reported.notes, *steps.notes]
-        notes += unknown_directions(self.recording, self.profile)
         notes += [one.reported for one in steps.findings if one.repaired]
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(

@@ -6,7 +6,7 @@ Of a laser scan, only the clearance per sector is kept, not the ranges.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from restock.errors import RecordingError, counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, cut, take
-from restock.ingest.profile.description import BASE_FRAMES, FIXED_FRAMES
+from restock.ingest.profile.description import FIXED_FRAMES
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import (
     FIELDS,
@@ -353,46 +353,6 @@ def _skipped(topic: str, available: Mapping[str, Any]) -> str:
     return f"{topic} is skipped, with {counted(info.expected, 'message')}: {info.skipped}"
 
 
-MAX_TRANSFORMS = 500  # messages searched per topic; few suffice, as transforms are repeated
-
-
-def unknown_directions(recording: Recording, profile: Profile) -> list[str]:
-    """Return a note for each lidar whose zero angle is assumed to point ahead, without evidence.
-
-    Evidence is an angle other than 0 in [task.body], any angle in the lidar's input, a transform
-    of the scans' frame, or a recorded robot description.
-    """
-    unsaid = {
-        name: source
-        for name, source in profile.inputs.scans.items()
-        if source.lidar_yaw_rad is None
-        and (source.lidar_at_m is not None or profile.task.body.lidar_yaw_rad == 0)
-        and source.topic in recording.topics
-    }
-    if not unsaid or any(name.endswith("/robot_description") for name in recording.topics):
-        return []
-    frames = {name: _first_frame(recording, source.topic) for name, source in unsaid.items()}
-    frames = {
-        name: frame
-        for name, frame in frames.items()
-        if frame and frame.split("/")[-1] not in BASE_FRAMES
-    }
-    left = set(frames.values())
-    few_first = sorted(recording.topics, key=lambda topic: recording.topics[topic].expected)
-    for topic in few_first if left else ():
-        for child in _children(recording, topic):
-            left.discard(child)
-            if not left:
-                return []
-    return [
-        f"{name}: no transform places {frame}, the frame of {unsaid[name].topic}: its zero is "
-        "assumed to point straight ahead; if it does, set lidar_at_m and lidar_yaw_rad = 0 in "
-        f"[inputs.{name}]"
-        for name, frame in frames.items()
-        if frame in left
-    ]
-
-
 def _first_frame(recording: Recording, topic: str) -> str:
     path = frame_id_path(recording.leaves(topic))
     if path is not None:
@@ -400,22 +360,6 @@ def _first_frame(recording: Recording, topic: str) -> str:
             for frame in np.asarray(fields[path], object)[:1]:
                 return plain(str(frame))
     return ""
-
-
-def _children(recording: Recording, topic: str) -> Iterator[str]:
-    """Yield the child frames of a topic of transforms; a frame may be yielded several times."""
-    layout = transform_fields(recording.leaves(topic))
-    if layout is None or recording.topics[topic].skipped:
-        return
-    path, count = layout[FIELDS.index("transforms[].child_frame_id")], 0
-    for times, fields in recording.batches(topic, [path]):
-        column = fields[path]
-        values = column.values if isinstance(column, Ragged) else column
-        children = set(map(str, np.asarray(values, object).ravel()))
-        yield from {plain(child) for child in children}
-        count += len(times)
-        if count > MAX_TRANSFORMS:
-            return
 
 
 # Names of columns computed from a scan. They have spaces, so as not to clash with field names.

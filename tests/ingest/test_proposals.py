@@ -28,7 +28,6 @@ from support.driven_robot import (
 )
 from support.ingested import ingested
 from support.paths import ROOT, SHARED, sample_transitions
-from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -414,28 +413,6 @@ def test_outline_contradicted_by_lidar_gives_advice(tmp_path):
         for advice in profile_json("check", file, bag)[1]["advice"]
     )
     assert propose(bag, "--footprint", "0.1x0.1")[0]["advice"] == []
-
-
-def test_ingest_notes_lidar_without_transform(tmp_path):
-    from restock.ingest.pipeline import ingest
-
-    ahead = "[inputs.scan]\nlidar_at_m = [0.0, 0.0]\nlidar_yaw_rad = 0.0"
-    shipped = load_profile("warehouse_amr")
-    points_ahead = parse_profile(WAREHOUSE.replace("[inputs.scan]", ahead), where="p")
-    leading = transforms(TENTHS, ("odom", "base_link"), ("base_link", "/laser"))
-    for number, (topics, profile, noted) in enumerate(
-        [
-            (with_laser(tf=MOVING), shipped, True),
-            (with_laser(), shipped, True),
-            (with_laser(tf=MOVING, tf_static=STATIC), shipped, False),
-            (with_laser("base_link", tf=MOVING), shipped, False),
-            (with_laser(tf=leading), shipped, False),
-            (with_laser(tf=MOVING), points_ahead, False),
-        ]
-    ):
-        bag = write_topics(topics, tmp_path / str(number), storage="mcap")
-        notes = ingest(bag, profile, store=None).notes
-        assert any("no transform places laser" in note for note in notes) is noted, number
 
 
 def test_utm_poses_are_stored_to_the_millimetre(tmp_path):
