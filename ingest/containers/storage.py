@@ -8,6 +8,7 @@ memory does not grow with the size of a recording.
 
 from __future__ import annotations
 
+import operator
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -18,17 +19,15 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 import zstandard
 
-from restock.arrays import Ints
 from restock.errors import RecordingError, visible
 from restock.ingest.decoding.columns import (
     Channel,
     FieldColumn,
-    GrowingArray,
-    GrowingRagged,
     MessageBatch,
     PendingBatch,
     TopicColumns,
-    growing,
+    join,
+    own,
     take,
 )
 from restock.ingest.decoding.row_by_row import Decoded
@@ -392,10 +391,8 @@ class TopicReading:
     ) -> None:
         self._account = Account(topic.name, topic.type, topic.expected)
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
-        no_times = np.zeros(0, np.int64)
-        self._log = GrowingArray(no_times)
-        self._publish: GrowingArray | None = None  # None while they equal the log times
-        self._fields: dict[str, GrowingArray | GrowingRagged] = {}
+        self._log, self._publish = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        self._fields: dict[str, list[FieldColumn]] = {}  # parts of each column, in file order
         self.decodable = False
         self.interleaved = False  # several channels in a file: batches are out of file order
 
@@ -412,7 +409,7 @@ class TopicReading:
         """Create columns for the decoded fields, even if no message comes."""
         self.decodable = True
         for path, column in self._kept(empty).items():
-            self._fields.setdefault(path, growing(column))
+            self._fields.setdefault(path, [column])
 
     def skip(self, reason: str, count: int) -> None:
         """Count messages that are not read at all."""
@@ -422,9 +419,12 @@ class TopicReading:
         """Decode a batch and keep its columns."""
         for plain, decoded in self.decoded(decode, batch):
             rows = decoded.rows
-            self._add_times(plain.log_time_ns[rows], plain.publish_time_ns[rows])
+            log_ns, publish_ns = plain.log_time_ns[rows], plain.publish_time_ns[rows]
+            self._log.append(log_ns)
+            # Most recorders do not know when a message was sent: then both are one array.
+            self._publish.append(log_ns if np.array_equal(log_ns, publish_ns) else publish_ns)
             for path, column in self._kept(decoded.fields).items():
-                self._fields[path].add(column, self._account.expected)
+                self._fields[path].append(own(column))
 
     def decoded(
         self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch
@@ -443,14 +443,6 @@ class TopicReading:
             self._add(decoded.bad)
             account.decoded += len(decoded.rows)
             yield plain, decoded
-
-    def _add_times(self, log_ns: Ints, publish_ns: Ints) -> None:
-        if self._publish is None and not np.array_equal(log_ns, publish_ns):
-            self._publish = GrowingArray(log_ns[:0])
-            self._publish.add(self._log.column(), self._account.expected)
-        self._log.add(log_ns, self._account.expected)
-        if self._publish is not None:
-            self._publish.add(publish_ns, self._account.expected)
 
     def _kept(self, fields: Fields) -> dict[str, FieldColumn]:
         kept = {path: fields[path] for path in self._wanted}
@@ -473,7 +465,7 @@ class TopicReading:
 
     def columns(self) -> TopicColumns:
         """Return all columns in the order of log time."""
-        log = self._log.column()
+        log = np.concatenate(self._log)
         fields: dict[str, FieldColumn] = {}
         order, lap = None, None
         backsteps = int((log[1:] < log[:-1]).sum())
@@ -485,10 +477,11 @@ class TopicReading:
                 lap = np.cumsum(set_back, dtype=np.int64)[order]
             log = log[order]
         publish = log
-        if self._publish is not None:
-            publish = self._publish.column() if order is None else self._publish.column()[order]
-        for path in list(self._fields):  # one by one, so that the unordered column is freed
-            column = self._fields.pop(path).column()
+        if not all(map(operator.is_, self._log[1:], self._publish[1:])):
+            publish = np.concatenate(self._publish)
+            publish = publish if order is None else publish[order]
+        for path in list(self._fields):  # one by one, so that the parts are freed
+            column = join(self._fields.pop(path))
             fields[path] = column if order is None else take(column, order)
         return TopicColumns(log, publish, fields, lap)
 

@@ -21,10 +21,6 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Ints
 from restock.errors import RecordingError, visible
 
-# Limit of the memory that is allocated ahead, as the file only claims its number of messages.
-# Memory that is allocated but not yet written to costs nothing.
-AHEAD_BYTES = 32 << 20
-
 
 @dataclass(frozen=True)
 class Ragged:
@@ -95,6 +91,13 @@ def join(columns: Sequence[FieldColumn]) -> FieldColumn:
     )
 
 
+def own(column: FieldColumn) -> FieldColumn:
+    """Copy a column, so that it keeps no buffer in memory that it is a view of."""
+    if isinstance(column, Ragged):
+        return Ragged(own(column.values), column.offsets.copy())
+    return column.copy()
+
+
 def equal(left: FieldColumn, right: FieldColumn) -> bool:
     """Return whether two columns have the same values (NaN equals NaN), shapes and types."""
     if isinstance(left, Ragged) or isinstance(right, Ragged):
@@ -154,64 +157,6 @@ class TopicColumns:
         return TopicColumns(
             self.log_time_ns[start:stop].copy(), self.publish_time_ns[start:stop].copy()
         )
-
-
-class GrowingArray:
-    """An array (N, …) that grows at its end, with memory reserved for the expected rows."""
-
-    def __init__(self, empty: NDArray[Any]) -> None:
-        self._room, self._size = empty[:0], 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    def add(self, part: FieldColumn, expected: int) -> None:
-        """Append a copy of a part; `expected` is the final number of rows, as far as known."""
-        assert not isinstance(part, Ragged)
-        size = self._size + len(part)
-        if size > len(self._room):
-            row_bytes = max(part.nbytes // max(len(part), 1), 1)
-            ahead = min(expected, size + max(AHEAD_BYTES // row_bytes, self._size))
-            room = np.empty((max(size, ahead), *self._room.shape[1:]), self._room.dtype)
-            room[: self._size] = self._room[: self._size]
-            self._room = room
-        self._room[self._size : size] = part
-        self._size = size
-
-    def column(self) -> NDArray[Any]:
-        """Return the whole column, (N, …)."""
-        return self._room[: self._size]
-
-
-class GrowingRagged:
-    """A ragged column that grows at its end."""
-
-    def __init__(self, empty: Ragged) -> None:
-        self._values = growing(empty.values)
-        self._offsets = GrowingArray(np.zeros(0, np.int64))
-        self._offsets.add(np.zeros(1, np.int64), 1)
-
-    def __len__(self) -> int:
-        return len(self._offsets) - 1
-
-    def add(self, part: FieldColumn, expected: int) -> None:
-        """Append a copy of a part, as `GrowingArray.add` does."""
-        assert isinstance(part, Ragged)
-        before, rows = len(self._values), len(self) + len(part)
-        inside = int(part.offsets[-1]) + before
-        # Expect as many values per row as so far, and a few more.
-        share = -(-inside * max(expected, rows) * 33 // (32 * max(rows, 1)))
-        self._values.add(part.values, share)
-        self._offsets.add(part.offsets[1:] + before, expected + 1)
-
-    def column(self) -> Ragged:
-        """Return the whole column."""
-        return Ragged(self._values.column(), self._offsets.column())
-
-
-def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
-    """Make a growing column of the same kind as this empty one."""
-    return GrowingRagged(empty) if isinstance(empty, Ragged) else GrowingArray(empty)
 
 
 DEEPEST = 24  # deepest nesting of messages; real types reach 6

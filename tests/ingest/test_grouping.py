@@ -4,7 +4,6 @@ import random
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,8 +17,6 @@ from support.long import one_in
 from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import storage as reading
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding import columns as columns_module
-from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store import transitions as transitions_module
@@ -35,7 +32,6 @@ def set_group_sizes(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
     patch.setattr(sqlite_file, "BYTES_PER_BATCH", size)
     patch.setattr(reading, "SMALL_ROWS", rows)
     patch.setattr(reading, "TOGETHER_ROWS", rows)
-    patch.setattr(columns_module, "AHEAD_BYTES", size)
 
 
 def read_grouped(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
@@ -135,24 +131,3 @@ def test_grouping_does_not_change_table(storage: str, tmp_path: Path) -> None:
         tables.append(rows.drop_columns(["ingest_id"]))
     assert len(tables[0]) > 30
     assert tables[0].equals(tables[1], check_metadata=True)
-
-
-@settings(max_examples=60)
-@given(
-    parts=st.lists(st.lists(st.lists(st.integers(0, 9), max_size=4), max_size=5), max_size=6),
-    expected=st.integers(0, 40),
-)
-def test_growing_column_concatenates_its_parts(parts, expected):
-    def column(rows: list[list[int]]) -> Ragged:
-        flat = np.array([value for row in rows for value in row], np.int32)
-        return Ragged(flat, offsets_of(np.array([len(row) for row in rows], np.int64)))
-
-    nested = growing(column([]))
-    plain = growing(np.zeros((0, 2), np.float32))
-    for part in parts:
-        nested.add(column(part), expected)
-        plain.add(np.array([(len(row), sum(row)) for row in part]).reshape(-1, 2), expected)
-    rows = [row for part in parts for row in part]
-    assert equal(nested.column(), column(rows))
-    flat = np.array([(len(row), sum(row)) for row in rows], np.float32).reshape(-1, 2)
-    assert equal(plain.column(), flat)
