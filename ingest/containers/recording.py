@@ -40,6 +40,7 @@ from restock.ingest.decoding.columns import (
     Leaf,
     MessageType,
     TopicColumns,
+    suggest_fields,
 )
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.row_by_row import Decoder
@@ -135,34 +136,14 @@ class Recording:
         return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
 
     def _note_several_types(self, topic: str) -> str | None:
-        """Return a note if a topic's messages have several types: which, and which are read."""
-        counts, read = Counter[str](), set[str]()
+        """Return a note if a topic's messages have several types."""
+        counts = Counter[str]()
         for stream in self._streams[topic]:
-            name = stream.channel.type
-            counts[name] += stream.storage.counts.get(stream.channel.id, 0)
-            if self._have_same_fields(stream, self._streams[topic][0]):
-                read.add(name)
+            counts[stream.channel.type] += stream.storage.counts.get(stream.channel.id, 0)
         if len(counts := +counts) < 2:
             return None
-        parts = [f"{count:,} of {name}" for name, count in counts.items()]
-        parts[0] = parts[0].replace(" of ", " messages of ", 1)
-        note = f"{topic} has {len(counts)} types: {', '.join(parts)}"
-        if counts.keys() <= read:
-            return note
-        return f"{note}: only those of {', '.join(sorted(read))} are read"
-
-    def _have_same_fields(self, one: _Stream, other: _Stream) -> bool:
-        """Return whether two streams have the same type, or types with the same fields.
-
-        For example, ROS 1 has both tf/tfMessage and tf2_msgs/TFMessage.
-        """
-        if one.channel.type == other.channel.type:
-            return True
-        try:
-            left, right = self._type(one).leaves(), self._type(other).leaves()
-        except CannotDecode:
-            return False
-        return one.channel.encoding == other.channel.encoding and left == right
+        each = ", ".join(f"{count:,} of {name}" for name, count in counts.items())
+        return f"{topic} has messages of several types: {each}"
 
     def _type(self, stream: _Stream) -> MessageType:
         key = self._storages.index(stream.storage), stream.channel.id
@@ -351,20 +332,17 @@ class Recording:
         return decoders
 
     def _make_decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
-        channel, kind = stream.channel, self._type(stream)
-        if not self._have_same_fields(stream, self._streams[topic][0]):
-            raise CannotDecode(f"it carries both {self.topics[topic].type} and {channel.type}")
-        try:
-            leaves = [kind.leaf(path) for path in paths]
-            first = self._type(self._streams[topic][0])
-            for leaf, before in zip(leaves, map(first.leaf, paths), strict=True):
-                if (leaf.kind, leaf.dims) != (before.kind, before.dims):
-                    raise CannotDecode(f"{leaf.path} is both a {before.kind} and a {leaf.kind}")
-        except RecordingError as error:
-            raise RecordingError(
-                error.what, where=f"{self.path}, {topic}", remedy=error.remedy
-            ) from None
-        return decoder_of(channel, kind, leaves)
+        kind, first = self._type(stream), self._type(self._streams[topic][0])
+        leaves = list[Leaf]()
+        for path in paths:
+            expected, leaf = first.by_path.get(path), kind.by_path.get(path)
+            if expected is None:
+                problem, where = suggest_fields(path, [*first.by_path]), f"{self.path}, {topic}"
+                raise RecordingError(f"{first.name} has {problem}", where=where)
+            if leaf is None or (leaf.kind, leaf.dims) != (expected.kind, expected.dims):
+                raise CannotDecode(f"{path} of {kind.name} is missing, or not as in {first.name}")
+            leaves.append(leaf)
+        return decoder_of(stream.channel, kind, leaves)
 
     def _lost(self, topic: str) -> dict[str, int]:
         """Count the messages of a topic that are known to be lost to damage, by reason."""

@@ -216,8 +216,7 @@ class FixedField:
     count: int | None  # length of a fixed array; None: one value
     align: int
     path: str | None  # None: not wanted
-    part: str = ""  # "sec" or "nanosec" of a time
-    also: str | None = None  # path of this part, if it is wanted besides the whole time
+    part: str = ""  # "sec" or "nanosec" of the time at `path`
 
     @property
     def size(self) -> int:
@@ -295,8 +294,6 @@ class FixedFields:
                 values = native(structs[name])
                 if field.dtype == np.bool_:
                     values = values != 0
-                if field.also is not None:
-                    out[field.also] = values
                 if field.part == "sec":
                     times[str(field.path)] = values.astype(np.int64) * SECOND_NS
                 elif field.part:

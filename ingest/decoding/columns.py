@@ -1,7 +1,7 @@
 """Messages of one channel: their fields, their serialised bytes, and the columns they become.
 
 A field path names a value inside a message: `twist.twist.linear.x`, `ranges`, `header.stamp`
-(nanoseconds), `poses[].pose.position.x` (one value per element of a sequence), `name` or `name[]`.
+(nanoseconds), `poses[].pose.position.x` (one value per element of a sequence).
 Names come from files, and go to terminals, tables and reports. Control characters in them are
 therefore escaped (`visible`) when they are read.
 """
@@ -12,6 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
-from restock.errors import RecordingError, visible
+from restock.errors import visible
 
 
 @dataclass(frozen=True)
@@ -242,17 +243,20 @@ class MessageType(ABC):
     def leaves(self) -> list[Leaf]:
         """Return every field path of the type, in the order of its definition.
 
-        A message that contains its own type has endless paths. Paths that repeat the type are left
-        out; `leaf` still resolves them.
-
         Raises:
             CannotDecode: it nests too deeply, or has too many fields.
         """
-        return [*self._by_path.values()]
+        return [*self.by_path.values()]
 
     @cached_property
-    def _by_path(self) -> dict[str, Leaf]:
-        """Return the leaves by path, computed once, as many recordings share a type."""
+    def by_path(self) -> dict[str, Leaf]:
+        """Return the leaves by path, computed once, as many recordings share a type.
+
+        A message that contains its own type has endless paths: those that repeat it are left out.
+
+        Raises:
+            CannotDecode: as `leaves`.
+        """
         every = self._leaves(self.name, "", (), (self.name,), [0])
         return {leaf.path: leaf for leaf in every}
 
@@ -281,38 +285,20 @@ class MessageType(ABC):
                 inside = (*within, member.message)
                 yield from self._leaves(member.message, inner, through, inside, count)
 
-    def leaf(self, path: str) -> Leaf:
-        """Resolve one field path.
 
-        Raises:
-            RecordingError: the type has no such field. The error lists its fields.
-        """
-        if path in self._by_path:
-            return self._by_path[path]
-        name, steps = self.name, list[FieldType]()
-        parts = path.split(".")
-        for place, part in enumerate(parts):
-            fields = {field.name: field for field in self.fields_of(name)}
-            field = fields.get(part.removesuffix("[]"))
-            last = place == len(parts) - 1
-            if field is None or (part.endswith("[]") and not field.many):
-                raise _no_field(self.name, path, f"{name} has {', '.join(fields) or 'no fields'}")
-            if field.many and not last and not part.endswith("[]"):
-                raise _no_field(self.name, path, f"{part} repeats: write {part}[]")
-            steps.append(field)
-            if last and field.base:
-                return Leaf(path, tuple(steps), field.base)
-            if last and field.message in self.times:
-                return Leaf(path, tuple(steps), "time")
-            if field.message is None:
-                raise _no_field(self.name, path, f"{part} is a {field.base}, it has no fields")
-            name = field.message
-        inside = ", ".join(field.name for field in self.fields_of(name))
-        raise _no_field(self.name, path, f"it is a message: name one of its fields ({inside})")
-
-
-def _no_field(kind: str, path: str, remedy: str) -> RecordingError:
-    return RecordingError(f"{kind} has no value at {path!r}", remedy=remedy)
+def suggest_fields(path: str, paths: list[str]) -> str:
+    """Return an error text for a missing field path that suggests similar paths."""
+    unbracketed = {known.replace("[]", ""): known for known in paths}
+    ends = {known.split(".")[-1]: known for known in paths}
+    near = [
+        unbracketed[name] for name in get_close_matches(path.replace("[]", ""), unbracketed, n=3)
+    ]
+    near = near or [ends[name] for name in get_close_matches(path.split(".")[-1], ends, n=3)]
+    problem = f"no field {path!r}"
+    if near:
+        return f"{problem}: did you mean {' or '.join(repr(name) for name in near)}?"
+    shown = ", ".join(paths[:12]) + (f" and {len(paths) - 12} more" if len(paths) > 12 else "")
+    return f"{problem}: the fields are {shown}"
 
 
 _SHORT_NAME = re.compile(r"(\w+)/(\w+)")

@@ -332,7 +332,7 @@ class _Compiler:
             plan.operations.append(Text(wanted, self.ros1))
             self._note(plan, wanted, "string", ())
         elif part.message in TIMES:
-            self._time(str(part.message), path, ".", plan, fixed)
+            self._time(str(part.message), path, plan, fixed)
         else:
             self._message(str(part.message), path + ".", plan, fixed)
 
@@ -345,7 +345,7 @@ class _Compiler:
             self._note(inner, wanted, "string", ())
         elif part.message in TIMES:
             inner, inner_fixed = CdrPlan([], {}), list[FixedField]()
-            self._time(str(part.message), path, "[].", inner, inner_fixed)
+            self._time(str(part.message), path, inner, inner_fixed)
             self._close(inner, inner_fixed)
         else:
             inner = self.plan(str(part.message), path + "[].")
@@ -354,23 +354,16 @@ class _Compiler:
         for inner_path, (kind, dims) in inner.paths.items():
             plan.paths[inner_path] = (kind, (length, *dims))
 
-    def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
-        """Add a time's two fields as wanted: as one value in ns, each by its own path, or both."""
+    def _time(self, name: str, path: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        """Add a time's two fields, which become one value in ns."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
         if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
             raise CannotDecode(f"{name} is not the standard definition of a time")
-        whole = self._wanted(path)
+        wanted, align = self._wanted(path), 1 if self.ros1 else 4
         for part, one in zip(("sec", "nanosec"), fields, strict=True):
-            dtype = DTYPES[str(one.base)]
-            align = 1 if self.ros1 else 4
-            part_path = self._wanted(path + dot + one.name)
-            if whole is not None:
-                fixed.append(FixedField(dtype, None, align, whole, part, part_path))
-            else:
-                fixed.append(FixedField(dtype, None, align, part_path))
-            self._note(plan, part_path, str(one.base), ())
-        self._note(plan, whole, "time", ())
+            fixed.append(FixedField(DTYPES[str(one.base)], None, align, wanted, part))
+        self._note(plan, wanted, "time", ())
 
     def _wanted(self, path: str) -> str | None:
         return path if path in self.wanted else None
@@ -415,13 +408,12 @@ class ColumnDecoder:
 
     def __init__(self, message: RosType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
         self._ros1 = ros1
-        # A path `name[]` is compiled as `name`: brackets at the end have no meaning.
-        self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}
-        self._plan = compile_plan(message, frozenset(self._paths.values()), ros1=ros1)
+        self._paths = [leaf.path for leaf in leaves]
+        self._plan = compile_plan(message, frozenset(self._paths), ros1=ros1)
 
     def empty(self) -> Columns:
         """Return columns without rows."""
-        return self._named(self._plan.empty())
+        return self._plan.empty()
 
     def decode(self, batch: MessageBatch) -> Decoded:
         """Decode a batch to columns; count messages that cannot be decoded, by reason."""
@@ -463,7 +455,7 @@ class ColumnDecoder:
                 bad[refused.reason] += len(refused_rows)
                 rows = np.setdiff1d(rows, refused_rows)
                 continue
-            return Decoded(rows, self._named(columns), bad)
+            return Decoded(rows, columns, bad)
         halves = np.array_split(rows, 2)
         return self._join([self._decode_rows(batch, h, order, header) for h in halves], bad)
 
@@ -480,9 +472,6 @@ class ColumnDecoder:
             path: take(join([part.fields[path] for part in parts]), back) for path in self._paths
         }
         return Decoded(rows[back], fields, bad)
-
-    def _named(self, columns: Columns) -> dict[str, FieldColumn]:
-        return {path: columns[compiled] for path, compiled in self._paths.items()}
 
 
 READABLE = ("cdr", "ros1", "json", "protobuf")

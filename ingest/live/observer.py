@@ -294,7 +294,7 @@ def _columns(messages: Sequence[_Message]) -> TopicColumns:
 def _column(message: Any, path: str) -> FieldColumn:
     """Return one message's value at a field path, as a column of one row."""
     head, repeated, tail = path.partition("[].")
-    value = _member(message, head.removesuffix("[]"))
+    value = _member(message, head)
     if repeated:
         value = [_member(item, tail) for item in value]
     if isinstance(value, str | bool | int | float):

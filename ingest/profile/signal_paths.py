@@ -23,14 +23,13 @@ import math
 import re
 from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools
-from restock.ingest.decoding.columns import FieldColumn, Ragged, take
+from restock.ingest.decoding.columns import FieldColumn, Ragged, suggest_fields, take
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.columns import Leaf
@@ -311,19 +310,6 @@ def _first(rows: Rows, parent: Rows) -> Rows:
 
 def _unbracketed(path: str) -> str:
     return path.replace("[]", "")
-
-
-def suggest_fields(path: str, paths: list[str]) -> str:
-    """Return an error text for a missing field path that suggests similar paths."""
-    unbracketed = {_unbracketed(known): known for known in paths}
-    ends = {known.split(".")[-1]: known for known in paths}
-    near = [unbracketed[name] for name in get_close_matches(_unbracketed(path), unbracketed, n=3)]
-    near = near or [ends[name] for name in get_close_matches(path.split(".")[-1], ends, n=3)]
-    problem = f"no field {path!r}"
-    if near:
-        return f"{problem}: did you mean {' or '.join(repr(name) for name in near)}?"
-    shown = ", ".join(paths[:12]) + (f" and {len(paths) - 12} more" if len(paths) > 12 else "")
-    return f"{problem}: the fields are {shown}"
 
 
 @dataclass(frozen=True)

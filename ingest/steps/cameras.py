@@ -202,7 +202,7 @@ def image_fields(kind: str) -> tuple[str, ...]:
 
 def wrong_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
     """Return the first field that is missing or not as ROS defines it; None if all are right."""
-    found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
+    found = {leaf.path: leaf for leaf in leaves}
     fields = image_fields(kind)
     return next((name for name in fields if not _is_field(name, found.get(name))), None)
 

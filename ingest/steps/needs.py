@@ -18,7 +18,14 @@ from restock.arrays import F64, Ints
 from restock.errors import RecordingError, counted
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Fields, Reduction
-from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, cut, take
+from restock.ingest.decoding.columns import (
+    FieldColumn,
+    Ragged,
+    TopicColumns,
+    cut,
+    suggest_fields,
+    take,
+)
 from restock.ingest.profile.description import FIXED_FRAMES
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import (
@@ -28,7 +35,6 @@ from restock.ingest.profile.signal_paths import (
     frame_path,
     plain,
     pressed_paths,
-    suggest_fields,
     transform_fields,
 )
 from restock.ingest.profile.tables import CLOUD, SCANS, CustomSignal, Input
@@ -187,7 +193,7 @@ def reductions(
     an estimate.
     """
     parts: dict[str, list[Reduction]] = {}
-    has = {topic: {leaf.path.removesuffix("[]") for leaf in some} for topic, some in leaves.items()}
+    has = {topic: {leaf.path for leaf in some} for topic, some in leaves.items()}
     inputs: dict[str, list[Input]] = {}
     for source in profile.sources.values():
         inputs.setdefault(source.topic, []).append(source)
@@ -314,12 +320,12 @@ def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Le
     if isinstance(source, CustomSignal):
         problem = source.problem(leaves)
         return [f"`{name}.path`: {source.topic}: {problem}"] if problem else []
-    has = {leaf.path.removesuffix("[]") for leaf in leaves}
+    has = {leaf.path for leaf in leaves}
     key = name if "." in name else f"inputs.{name}"
     return [
         f"`{key}.fields`: {source.topic}: {suggest_fields(path, sorted(has))}"
         for path in field_paths(source)
-        if path.removesuffix("[]") not in has
+        if path not in has
     ]
 
 
