@@ -55,7 +55,6 @@ class Statistics(NamedTuple):
 class Contents:
     """The contents of an MCAP file, as found by a walk over its top-level records."""
 
-    profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
     loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
     definitions: Definitions = field(default_factory=Definitions)  # outside chunks
@@ -160,8 +159,6 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
         named = parse(Op.METADATA, file, at, stop)
         _add_extra(contents, Extra("metadata", named["name"], "", stop - at))
         _add_metadata(contents, file.path.name, named["name"], named["metadata"])
-    elif opcode == Op.HEADER and not contents.profile:
-        contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
 
 
 def check_summary(contents: Contents, file: FileBytes, at: int, stop: int) -> list[str]:

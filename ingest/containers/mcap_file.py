@@ -203,7 +203,6 @@ class McapFile(Storage):
         if self._file[: len(MAGIC)] != MAGIC:
             raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
         self._contents = survey(self._file, watch)
-        self.from_ros2 = self._contents.profile == "ros2"
         for what in self._contents.damaged:
             self.damaged(what)
         self._refuse_cut(salvage)

@@ -40,7 +40,6 @@ from restock.ingest.containers.storage import (
     no_progress,
     yaml_value,
 )
-from restock.ingest.decoding.decoders import READABLE
 from restock.ingest.decoding.definitions import DEFAULT_DISTRO, choose_definitions
 
 
@@ -226,7 +225,6 @@ class ClaimedTopic:
     """A topic in metadata.yaml. Values that are missing or of a wrong type are None."""
 
     name: str | None
-    serialization: str | None
     messages: int | None
 
 
@@ -326,7 +324,6 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
         tuple(
             ClaimedTopic(
                 _of_type(topic["topic_metadata"].get("name"), str),
-                _of_type(topic["topic_metadata"].get("serialization_format"), str),
                 _of_type(topic.get("message_count"), int),
             )
             for topic in topics
@@ -438,8 +435,8 @@ def open_recording(
             total.
 
     Raises:
-        RecordingError: the file does not exist, is empty, a Git LFS pointer or not a recording, is
-            cut short (unless `salvage`), or is a ROS 2 bag that is not serialised as CDR.
+        RecordingError: the file does not exist, is empty, a Git LFS pointer or not a recording,
+            or cut short (unless `salvage`).
     """
     path = recording_path(path)
     distro = choose_definitions(definitions)  # may raise, so before a file is opened
@@ -506,7 +503,6 @@ class _Opening:
     def _open(self) -> Recording:
         files, metadata = self._files()
         files = self._open_files(files)
-        self._refuse_serialisation(metadata)
         self._compare(metadata, files)
         if files_of := self.containers[0].files:
             files = [*files_of(self.path)]
@@ -595,20 +591,6 @@ class _Opening:
             )
         container = self.containers[0]
         return container.bag_format if self.path.is_dir() else container.format
-
-    def _refuse_serialisation(self, metadata: BagMetadata) -> None:
-        """Refuse serialisations other than CDR, which rosbag2 can also store."""
-        ros2 = [storage for storage in self.storages if storage.from_ros2]
-        encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
-        claimed = {topic.serialization for topic in metadata.topics if topic.serialization}
-        for names in (encodings, claimed):
-            if names and not names & set(READABLE):
-                listed = ", ".join(sorted(map(repr, names)))
-                raise RecordingError(
-                    f"its messages are serialised as {listed}, and only CDR is supported",
-                    where=str(self.path),
-                    remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
-                )
 
     def _compare(self, metadata: BagMetadata, files: list[Path]) -> None:
         """Compare metadata.yaml with the files.

@@ -83,8 +83,6 @@ class SqliteFile(Storage):
         RecordingError: it is not rosbag2's.
     """
 
-    from_ros2 = True
-
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path

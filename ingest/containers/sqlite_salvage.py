@@ -257,8 +257,6 @@ class SalvagedSqliteFile(Storage):
         RecordingError: no topic can be found in it.
     """
 
-    from_ros2 = True
-
     def __init__(
         self, path: Path, what: str, copy: tempfile.TemporaryDirectory[str] | None = None
     ) -> None:

@@ -159,14 +159,12 @@ class Storage(ABC):
     container's own count) and `span_ns` (the first and last log time; None without messages).
     `damage` is complete once everything wanted has been read. `notes` tell the user about things
     that lose no data. `extras` lists attachments and metadata records; `metadata` has the entries
-    that describe the whole recording. `from_ros2` is whether a ROS 2 middleware serialised the
-    messages.
+    that describe the whole recording.
     """
 
     channels: dict[int, Channel]
     counts: dict[int, int]
     span_ns: tuple[int, int] | None
-    from_ros2: bool = False
 
     def __init__(self) -> None:
         self.damage: list[Damage] = []
