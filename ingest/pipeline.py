@@ -249,8 +249,7 @@ class _Ingest:
     def run(self, store: StoreWriter | None) -> Work[Prepared]:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
-        # The next stages need to know which topics had messages, not their values: free the values.
-        columns = {name: column.times(0, 1) for name, column in columns.items()}
+        del columns  # frees the values of all messages
         watch, ticks = self.recording.watch, len(steps)
         episodes = split(profile.task, steps)
         if not episodes.transitions:
@@ -274,14 +273,16 @@ class _Ingest:
         named = Counter(table["condition"].to_pylist())
         first = {name: named[name] for name in (*rows.labels, NOMINAL)}
         scores = label_scores(table, rows.labels, profile.task.control_period_s)
-        facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
+        facts = recorded_facts(self.recording, steps, episodes, rows)
         facts |= {
             "tags": self.reported.tags,
             "labels_version": table["labels_version"][0].as_py(),
             "corrections": [asdict(one) for one in self.corrections],
         }
-        steps = steps.without_values()
         kept = [KeptFrames.of(name, one, rows.tick) for name, one in steps.cameras.items()]
+        losses, notes = self._describe_losses(steps), self._notes(steps, table)
+        findings = [one.reported for one in steps.findings if not one.repaired]
+        del steps  # frees the values of all ticks
         path = own_path(provenance.recording_id, self.ingest_id)
         file = path if sum(len(one.row) for one in kept) else ""
         facts["cameras"] = [one.manifest_row(self.recording, file) for one in kept]
@@ -304,9 +305,9 @@ class _Ingest:
             {name: int(holds[rows.starts].sum()) for name, holds in rows.exposures.items()},
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
-            self._describe_losses(steps),
-            [one.reported for one in steps.findings if not one.repaired],
-            self._notes(steps, table),
+            losses,
+            findings,
+            notes,
         )
         return Prepared(result, staged, self.repeated)
 

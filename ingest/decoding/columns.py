@@ -153,12 +153,6 @@ class TopicColumns:
         laps = [self.log_time_ns[self.lap == lap] for lap in range(self.laps() + 1)]
         return np.concatenate([np.diff(lap) for lap in laps]) * 1e-9
 
-    def times(self, start: int, stop: int) -> TopicColumns:
-        """Copy the log times of messages `start` to `stop`, without their fields."""
-        return TopicColumns(
-            self.log_time_ns[start:stop].copy(), self.publish_time_ns[start:stop].copy()
-        )
-
 
 DEEPEST = 24  # deepest nesting of messages; real types reach 6
 MAX_FIELDS = 20_000

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import BY_LOG_TIME, ClockReport
-from restock.ingest.steps.aligned_inputs import align_inputs
+from restock.ingest.steps.aligned_inputs import align_inputs, fallbacks_used
 from restock.ingest.steps.cameras import CameraFrames
 from restock.ingest.steps.clocks import TopicClock, topic_clocks
 from restock.ingest.steps.consistency import Finding, findings_of
@@ -63,33 +63,10 @@ class Steps:
     clocks: list[TopicClock] = field(default_factory=list)  # one per topic that was read
     findings: list[Finding] = field(default_factory=list)  # contradictions between topics
     notes: list[str] = field(default_factory=list)  # notes for the user
-    stand_ins: dict[str, str] = field(default_factory=dict)  # what replaces unmeasured inputs
+    stand_ins: dict[str, str] = field(default_factory=dict)  # what replaces missing inputs
 
     def __len__(self) -> int:
         return len(self.segment)
-
-    def without_values(self) -> Steps:
-        """Return a copy without values per tick, to free their memory."""
-        ticks, flags = np.zeros(0, np.int64), np.zeros(0, np.bool_)
-        return replace(
-            self,
-            signals={},
-            segment=ticks,
-            follows=flags,
-            break_reason=[],
-            problem=[],
-            route_problem=[],
-            routing=Routing.none(0),
-            action=ticks,
-            residual=np.zeros(0),
-            policy=[],
-            policy_version=[],
-            probability=[],
-            truth=[],
-            true_exposure=[],
-            perturbed=Perturbed.unknown(0),
-            logged_ns=ticks,
-        )
 
 
 def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
@@ -136,7 +113,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         clocks,
         findings_of(aligned, signals, filling.segment, list(filling.problem)),
         [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
-        stand_ins=filling.stand_ins,
+        stand_ins=fallbacks_used(profile, topics) | filling.stand_ins,
     )
 
 

@@ -29,9 +29,7 @@ import pyarrow as pa
 
 from restock.arrays import Bools, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile, profile_toml
-from restock.ingest.steps.aligned_inputs import fallbacks_used
 from restock.ingest.steps.episodes import Split, Steps
 from restock.ingest.store.transitions import EpisodeRows, Provenance, names_of, replaced
 from restock.ingest.task.conditions import (
@@ -128,15 +126,12 @@ def driven_plan(rows: pa.Table) -> bool:
 
 def recorded_facts(
     recording: Recording,
-    profile: Profile,
-    columns: Mapping[str, TopicColumns],
     steps: Steps,
     episodes: Split,
     rows: EpisodeRows,
 ) -> dict[str, Any]:
     """Return the columns that `manifest_row` cannot fill without the recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
-    fallbacks = fallbacks_used(profile, columns) | steps.stand_ins
     return {
         "format": recording.format,
         "integrity": recording.integrity,
@@ -151,7 +146,7 @@ def recorded_facts(
         "episodes": len(episodes.episodes),
         "episode_ends": episodes.ends,
         "topics": topic_rows(recording),
-        "stand_ins": [{"input": name, "instead": how} for name, how in fallbacks.items()],
+        "stand_ins": [{"input": name, "instead": how} for name, how in steps.stand_ins.items()],
         "clocks": clock_rows(recording, steps),
         "findings": [one.as_row() for one in steps.findings],
         "signals": steps.custom.rows(),
