@@ -20,7 +20,6 @@ from restock.ingest.containers.mcap_records import (
     Chunk,
     Definitions,
     Indexed,
-    Messages,
     Op,
     Positions,
 )
@@ -86,12 +85,12 @@ class ChunkReader:
                 [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
             )
             for channel in sorted(set().union(*located)):
-                yield channel, join_parts(buffer, [at[channel] for at in located if channel in at])
+                yield channel, _join([at[channel] for at in located if channel in at])
         self._scratch = np.zeros(0, np.uint8)  # free this memory: the file stays open
 
     def _find_by_index(
         self, parts: list[_Part], buffer: NDArray[np.uint8], wanted: set[int]
-    ) -> dict[int, Messages] | None:
+    ) -> dict[int, MessageBatch] | None:
         """Find messages of chunks by the chunks' indexes; None if one is missing or wrong."""
         entries: dict[int, list[Indexed]] = {}
         for chunk, base, size in parts:
@@ -146,7 +145,7 @@ class ChunkReader:
 
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
-    ) -> dict[int, Messages]:
+    ) -> dict[int, MessageBatch]:
         """Find a chunk's messages by its index, or by a walk if the index is missing or wrong."""
         located = self._find_by_index([part], buffer, wanted)
         if located is not None:
@@ -172,10 +171,12 @@ class ChunkReader:
         return positions
 
 
-def join_parts(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
+def _join(parts: list[MessageBatch]) -> MessageBatch:
     """Join messages from several places of one buffer into one batch."""
+    if len(parts) == 1:
+        return parts[0]
     return MessageBatch(
-        buffer,
+        parts[0].buffer,
         np.concatenate([part.start for part in parts]),
         np.concatenate([part.stop for part in parts]),
         np.concatenate([part.log_time_ns for part in parts]),
@@ -289,7 +290,7 @@ class McapFile(Storage):
         contents = self._contents
         # A chunk without messages has the span 0 to 0.
         spans = [chunk.span_ns for chunk in contents.chunks if any(chunk.span_ns)]
-        for _, _, messages in self._loose(contents.loose):
+        for _, messages in self._loose(contents.loose):
             stamps = messages.log_time_ns
             spans.append((int(stamps.min()), int(stamps.max())))
         if not spans or not any(self.counts.values()):
@@ -329,13 +330,10 @@ class McapFile(Storage):
         loose = wanted & self._contents.loose.keys()
         if loose:
             self._check_loose()
-        for channel, buffer, messages in self._loose(loose):
-            yield channel, join_parts(buffer, [messages])
+        yield from self._loose(loose)
         yield from self._chunks.read(self._groups(wanted), wanted)
 
-    def _loose(
-        self, channels: Collection[int]
-    ) -> Iterator[tuple[int, NDArray[np.uint8], Messages]]:
+    def _loose(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Yield channels' messages outside chunks, about 8 MiB of the file at a time."""
         places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
         if not places:
@@ -352,7 +350,7 @@ class McapFile(Storage):
             ends = [_record_end(self._file, int(at[-1])) for at in some.values()]
             buffer = np.frombuffer(self._file[start : max(ends, default=start)], np.uint8)
             for channel, at in some.items():
-                yield channel, buffer, mcap_records.messages_at(buffer, at - start)
+                yield channel, mcap_records.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
         """Yield the chunks that contain these channels, in groups that grow to about 8 MiB.

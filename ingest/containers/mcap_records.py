@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.ingest.containers.chunks import Buffer, StoredChunk
-from restock.ingest.decoding.columns import Channel, gather
+from restock.ingest.decoding.columns import Channel, MessageBatch, gather
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_KEPT = 64 << 10  # largest definition, in bytes, that is cached for other files
@@ -249,19 +249,6 @@ class Chunk(StoredChunk):
         }
 
 
-@dataclass
-class Messages:
-    """Messages of one channel in one buffer."""
-
-    start: Ints
-    stop: Ints
-    log_time_ns: Ints
-    publish_time_ns: Ints
-
-    def __len__(self) -> int:
-        return len(self.start)
-
-
 @dataclass(frozen=True)
 class Indexed:
     """A channel's index entries in one chunk, which lies at buffer[base:base + size]."""
@@ -273,7 +260,7 @@ class Indexed:
 
 def indexed_messages(
     buffer: NDArray[np.uint8], parts: Sequence[Indexed], channel: int
-) -> Messages | None:
+) -> MessageBatch | None:
     """Find a channel's messages with its index entries in chunks, given in buffer order.
 
     None if the index does not fit the chunks, which must then be walked.
@@ -281,9 +268,6 @@ def indexed_messages(
     if any(len(part.entries) % _INDEX.itemsize for part in parts):
         return None
     offset = np.frombuffer(b"".join(part.entries for part in parts), _INDEX)["offset"]
-    if not len(offset):
-        empty = np.zeros(0, np.int64)
-        return Messages(empty, empty, empty, empty)
     counts = [len(part.entries) // _INDEX.itemsize for part in parts]
     base = np.repeat(np.array([part.base for part in parts], np.int64), counts)
     size = np.repeat(np.array([part.size for part in parts], np.int64), counts)
@@ -301,7 +285,7 @@ def indexed_messages(
         or (length < HEAD_SIZE - PREFIX).any()
     ):
         return None
-    messages = _messages(at, head)
+    messages = _messages(buffer, at, head)
     return None if (messages.stop > base + size).any() else messages
 
 
@@ -339,13 +323,14 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
     return {number: at[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 
-def messages_at(buffer: NDArray[np.uint8], at: Ints) -> Messages:
+def messages_at(buffer: NDArray[np.uint8], at: Ints) -> MessageBatch:
     """Return the messages whose records start at these positions, which a walk found."""
-    return _messages(at, gather(buffer, at, _HEAD))
+    return _messages(buffer, at, gather(buffer, at, _HEAD))
 
 
-def _messages(at: Ints, head: NDArray[np.void]) -> Messages:
-    return Messages(
+def _messages(buffer: NDArray[np.uint8], at: Ints, head: NDArray[np.void]) -> MessageBatch:
+    return MessageBatch(
+        buffer,
         at + HEAD_SIZE,
         at + PREFIX + head["length"].astype(np.int64),
         _to_int64_times(head["log_time"]),
