@@ -46,7 +46,6 @@ SIZES_M = (0.02, 30.0)  # smallest and largest plausible length or width of a ro
 
 
 MIN_ASIDE_M = 0.05  # a lidar this far left or right of the middle counts as aside
-DESCRIBED = "as described"  # source of a lidar's place
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Footprint:
     lidar_x_m: float | None = None  # ahead of the middle; None: unknown
     lidar_y_m: float = 0.0  # to the left of the middle
     lidar_yaw_rad: float | None = None
-    lidar_source: str = DESCRIBED
+    lidar_source: str = "a guess"  # where `lidar_x_m` is from, in words
     upside_down: bool = False  # whether the lidar is mounted upside down
     lidar_unplaced: str = ""  # frame of the lidar's scans, if nothing gives its direction, else ""
     measured: bool = True  # False: the outline is a guess
@@ -168,6 +167,7 @@ def of_urdf(text: RobotText, scan_frame: str = "") -> Footprint | str:
         lidar_x_m=at_m[0] - middle_x,
         lidar_y_m=at_m[1] - middle_y,
         lidar_yaw_rad=yaw,
+        lidar_source="as described",
         upside_down=upside_down,
     )
 
@@ -411,7 +411,8 @@ def with_lidar(footprint: Footprint, edges: Edges, scan_frame: str) -> Footprint
     yaw_rad = float(np.arctan2(turn[1, 0], turn[0, 0]))
     turned = replace(footprint, lidar_yaw_rad=yaw_rad, upside_down=bool(turn[2, 2] < 0))
     if footprint.measured and abs(x_m) > footprint.length_m / 2:
-        return replace(turned, lidar_source=f"{bases[0]} has it {x_m:.2f} m ahead, outside")
+        why = f"a guess; {bases[0]} has it {x_m:.2f} m ahead, outside"
+        return replace(turned, lidar_source=why)
     length_m, width_m = footprint.length_m, footprint.width_m
     if not footprint.measured:  # enlarge a guess to include the lidar
         length_m, width_m = max(length_m, 2 * abs(x_m)), max(width_m, 2 * abs(y_m))

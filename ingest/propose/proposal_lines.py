@@ -18,7 +18,7 @@ from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.profile.tables import CLOUD, FALLBACKS, SCAN_OF_CLOUD, Input
 from restock.ingest.propose.clock_choice import ClockChoice
 from restock.ingest.propose.commands import Commands
-from restock.ingest.propose.footprint import DESCRIBED, GUESS, TIGHT_PER_WIDTH, range_lines
+from restock.ingest.propose.footprint import GUESS, TIGHT_PER_WIDTH, range_lines
 from restock.ingest.propose.gather import Evidence
 from restock.ingest.propose.pose_choice import fix_lines, fix_noise_lines, frame_lines
 from restock.ingest.propose.robot_choice import RobotProposal
@@ -510,10 +510,8 @@ def _body_lines(seen: Evidence, advice: Sequence[Advice]) -> list[str]:
     if aside:
         lines.append("# Clearance is as from the middle: lidar_at_m of the inputs.")
     elif seen.roles["scan"]:
-        why = "a guess" if x is None else footprint.lidar_source
-        if x is None and footprint.lidar_source != DESCRIBED:
-            why += f"; {footprint.lidar_source}"
-        lines.append(f"lidar_x_m = {round(x or 0.0, 3):g}  # ahead of the middle; {why}")
+        why = f"ahead of the middle; {footprint.lidar_source}"
+        lines.append(f"lidar_x_m = {round(x or 0.0, 3):g}  # {why}")
     if yaw and abs(yaw) > 1e-3 and not aside:
         lines.append(f"lidar_yaw_rad = {round(yaw, 4):g}")
     near_m = round(max(TIGHT_PER_WIDTH * footprint.width_m, MIN_TIGHT_M), 3)

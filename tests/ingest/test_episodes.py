@@ -78,16 +78,6 @@ def test_lost_plan_ends_episode_and_drops_ticks():
     assert found.dropped == {"plan: for another goal": 20}
 
 
-def test_time_limit_truncates_episode():
-    found = episodes_of(Drive().topics(), time_limit_steps=12)
-    assert [(e.first, e.last, e.ended_by) for e in found.episodes] == [
-        (0, 12, "time limit"),
-        (12, 24, "time limit"),
-        (24, 29, "end of the recording"),
-    ]
-    assert not any(e.terminated for e in found.episodes)
-
-
 @pytest.mark.parametrize(
     ("goals", "pressed", "spans", "dropped"),
     [
