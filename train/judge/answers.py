@@ -42,21 +42,6 @@ class Response:
     offsets: F64  # (R,)
     kernel: F64  # (L,)
     moments: F64  # (C, L + 1, L + 1) sums of products of x at each lag and y, per cluster
-    centred: bool = False  # whether the fit has an intercept, `offset`
-
-    def explains(self, kernel: F64, usual: float) -> float:
-        """Return the share of the misfit to `kernel` that this fit removes, at most 1.
-
-        A scale, delay or bias leaves `usual` (a share of y's mean square) once it is undone, noise
-        and values of other rows leave more. NaN if `kernel` fits as well as usual.
-        """
-        moments = self.moments.sum(axis=0)
-        xx, xy, yy = moments[:-1, :-1], moments[:-1, -1], float(moments[-1, -1])
-        as_is, fitted = (yy - 2 * float(one @ xy) + float(one @ xx @ one)
-                         for one in (kernel, self.kernel))  # fmt: skip
-        fitted -= self.rows * self.offset**2 if self.centred else 0.0
-        misfit = as_is - usual * yy
-        return min((as_is - fitted) / misfit, 1.0) if misfit > 0 else math.nan
 
     def unresponsive(self, kernel: F64) -> tuple[int, int]:
         """Count the clusters that do not respond as `kernel` predicts, and those that were judged.
@@ -117,7 +102,7 @@ def fit_response(
     return Response(
         len(y), clusters, float(gain[0]), float(delay[0]), float(unexplained[0]),
         gain[1:], delay[1:], unexplained[1:], float(offset[0]), offset[1:],
-        h[0], moments.reshape(-1, width, width).astype(np.float64), centred,
+        h[0], moments.reshape(-1, width, width).astype(np.float64),
     )  # fmt: skip
 
 
@@ -152,13 +137,10 @@ def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
 
 ACTION_SPEED, ACTION_TURN = "action (speed)", "action (turn)"
 WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
-POSE, HEADING = "pose", "pose (heading)"
-GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "gyroscope", "accelerometer", "plan", "lidar"
-PROPOSAL = "proposal"
+POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
 COMMANDS = np.arange(-4, 8)  # lags in steps: responses come late, or early if logs are wrong
 SENSORS = np.arange(-3, 4)
 PLANS = np.arange(-3, 7)
-SCANS = np.arange(-2, 4)
 NOW = np.zeros(1, np.int64)
 _JUMP_RAD, _JUMP_M = 0.8, 0.6  # larger changes in one step mean that the plan was replaced
 _SLOW_MPS = 0.3  # below this speed a waypoint's bearing changes by turning, not by driving past it
@@ -176,7 +158,6 @@ TURN_RADPS = 0.06  # largest turn that a sensor may show while the action has no
 BIAS_MPS2 = 0.2
 SIDEWAYS = 0.06  # largest ratio of sideways to forward motion, about 3 degrees
 ARM_M = 0.06  # largest distance between the pose's point and the point that the robot turns about
-MOUNT = 0.25  # largest share of the sideways acceleration in the forward one, about 15 degrees
 STRAYED = 0.05  # largest share of missions without response, beyond the twin's
 _STRAIGHT_RADPS = 0.15  # slower turns count as driving straight
 
@@ -189,8 +170,7 @@ class Relation:
     x: str
     y: str
     lags: Ints
-    # x and y of rows, (N,); of S lidar sectors and L lags, (N, S, L) and (N, S)
-    of: Callable[[FedRows], tuple[F64, F64]]
+    of: Callable[[FedRows], tuple[F64, F64]]  # x and y of rows, (N,), or (N, S) for S lidar sectors
     defined: bool = True  # x and y are the same quantity: without a twin, the expected gain is 1
     zero: str = ""  # name under which the gain is reported if it should be 0; else ""
     most: float = GAIN  # largest ratio to the twin's gain, either way; with `zero`, largest |gain|
@@ -204,9 +184,9 @@ class Relation:
         x, y = self.of(rows)
         y = y.copy()
         y[_rows_to_leave_out(rows, _motion(x, y), leave_out)] = np.nan
-        if x.ndim == 3:
+        if x.ndim == 2:
             cluster = np.repeat(rows.cluster, x.shape[1])
-            return fit_response(x.reshape(-1, x.shape[2]), y.reshape(-1), cluster, self.lags, rng)
+            return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
         before = [rows.before(int(lag)) for lag in self.lags]
         return fit_response(
             lagged(x, before), y, rows.cluster, self.lags, rng, centred=self.offset < math.inf
@@ -227,8 +207,6 @@ class Relation:
 
 def _motion(x: F64, y: F64) -> F64:
     """Return the weight of each row in the fit, (N,)."""
-    if x.ndim == 3:
-        x = np.nan_to_num(x).max(axis=2)
     moves = np.where(np.isfinite(y), x, 0.0) ** 2
     return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
 
@@ -308,20 +286,6 @@ def _wheel_acceleration(rows: FedRows) -> F64:
     return np.asarray(change / rows.task.control_period_s)
 
 
-def _sideways_acceleration(rows: FedRows) -> tuple[F64, F64]:
-    """Return the sideways acceleration in turns (m/s2), and what the accelerometer shows of it."""
-    sideways = rows.after("wheel_speed") * rows.after("gyro_yaw_rate")
-    return sideways, 5.0 * rows.after("accel_x") - _wheel_acceleration(rows)
-
-
-def _proposed_turn(rows: FedRows) -> tuple[F64, F64]:
-    """Return the waypoint's bearing (rad), and the yaw rate that navigation proposes (rad/s)."""
-    bearing = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
-    fastest = float(np.abs(rows.task.actions).max(axis=0)[1])
-    proposed = np.where(rows.now("nav_known") > 0, rows.now("nav_yaw_rate") * fastest, np.nan)
-    return bearing, proposed
-
-
 def _waypoint_turn(rows: FedRows) -> F64:
     """Return the yaw rate (rad/s) by the waypoint's bearing; NaN if driving or replanned."""
     now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
@@ -346,21 +310,19 @@ def _route_speed(rows: FedRows) -> F64:
 
 
 def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
-    """Return the change of lidar sectors expected from `turn` (N,) in rad/s, and the actual one.
+    """Return the change of lidar sectors (N, S) expected from `turn` (rad/s), and the actual one.
 
-    The expected change, (N, S, L), is that of the turn at each of L lags. The actual change,
-    (N, S), is NaN if nothing was seen, at edges, and in slow turns.
+    The actual change is NaN if nothing was seen, at edges, and in slow turns.
     """
     now, after = rows.sectors(), rows.sectors(after=True)
     width = 2 * np.pi / max(rows.task.sectors, 1)
     slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
-    turns = lagged(turn, [rows.before(int(lag)) for lag in SCANS])  # (N, L)
-    expected = slope[:, :, None] * (turns * rows.task.control_period_s)[:, None, :]
+    expected = slope * (turn * rows.task.control_period_s)[:, None]
     changed = after - now
     unseen = (now > _FAR) | (after > _FAR)
     unseen |= np.roll(unseen, 1, axis=1) | np.roll(unseen, -1, axis=1)
     unseen |= np.abs(slope) > 1.0  # an edge: what lies behind it comes into view
-    unseen |= (np.abs(turns).max(axis=1) < 0.2)[:, None]
+    unseen |= (np.abs(turn) < 0.2)[:, None]
     return expected, np.where(unseen, np.nan, changed)
 
 
@@ -381,27 +343,23 @@ RELATIONS = (
     Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), wheel_turn(rows)),
              most=ALIKE, offset=BIAS_RADPS, unit="rad/s"),
-    Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, HEADING, SENSORS,
+    Relation("yaw rate of the pose to the gyroscope", GYROSCOPE, POSE, SENSORS,
              lambda rows: (rows.after("gyro_yaw_rate"), _pose_turn(rows)), offset=BIAS_RADPS,
              unit="rad/s"),
-    Relation("motion of the pose to its heading", HEADING, POSE, NOW, _straight_speeds,
+    Relation("motion of the pose to its heading", POSE, POSE, NOW, _straight_speeds,
              zero="turn", most=SIDEWAYS),
     Relation("motion of the pose to its turn", POSE, POSE, NOW, _turn_and_drift,
              zero="arm", most=ARM_M),
     Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
              lambda rows: (_wheel_acceleration(rows), 5.0 * rows.after("accel_x")), False,
              offset=BIAS_MPS2, unit="m/s2"),
-    Relation("acceleration to the turn of the robot", ACCELEROMETER, ACCELEROMETER, NOW,
-             _sideways_acceleration, zero="mount", most=MOUNT),
     Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
              lambda rows: (rows.after("gyro_yaw_rate"), _waypoint_turn(rows)), False),
     Relation("remaining distance to the speed of the pose", POSE, PLAN, PLANS,
              lambda rows: (rows.after("localised_speed"), _route_speed(rows)), False),
-    Relation("turn of navigation's proposal to the waypoint", PLAN, PROPOSAL, NOW,
-             _proposed_turn, False, unit="rad/s"),
-    Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, SCANS,
+    Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
              lambda rows: _scan_flow(rows, rows.after("gyro_yaw_rate")), False),
-    Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, SCANS,
+    Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
              lambda rows: _scan_flow(rows, wheel_turn(rows)), False),
 )  # fmt: skip
 
@@ -440,7 +398,6 @@ class Answer:
     rows: FedRows | None = None  # of the logs; None if not comparable with other robots' rows
     found: Response | None = None  # the relation as fitted to the logs
     broken: Broken | None = None  # set if more stretches break than for other robots
-    explained: float = math.nan  # share of the misfit that any scale, delay or bias explains
 
     @property
     def off(self) -> bool:
@@ -548,8 +505,7 @@ def _answer(
         )
     )  # fmt: skip
     by = delay.value if timed else 0.0
-    explained = found.explains(expected.kernel, expected.unexplained)
-    return Answer(relation, made, gain.value, by, logs, found, explained=explained)
+    return Answer(relation, made, gain.value, by, logs, found)
 
 
 def held_motion(rows: FedRows) -> list[F64]:

@@ -45,21 +45,14 @@ def beside_others(
     ]
     for of_relation in zip(*answers, strict=True):
         _compare_relation(of_relation)
-        if len(of_relation[0].relation.lags) > 1 and of_relation[0].relation.y != ends.LIDAR:
+        if of_relation[0].relation.lags is not ends.NOW:
             _compare_stretches(of_relation, odd)
     return values
 
 
 def _compare_relation(answers: Sequence[Answer]) -> None:
     """Compare each robot's figures of one relation with the median of the others."""
-    allowed = _allowed(answers[0].relation)
-    for place, own in enumerate(answers if allowed else ()):
-        fits = [one.found for other, one in enumerate(answers) if other != place and one.found]
-        if own.found is not None and len(fits) >= MIN_BESIDE - 1:
-            kernel = np.median([one.kernel for one in fits], axis=0)
-            usual = float(np.median([one.unexplained for one in fits]))
-            own.explained = own.found.explains(kernel, usual)
-    for figure, least, most in allowed:
+    for figure, least, most in _allowed(answers[0].relation):
         rows = [_find_comparison(one, figure) for one in answers]
         for place, own in enumerate(rows):
             others = [one for other, one in enumerate(rows) if other != place and one is not None]
@@ -192,7 +185,7 @@ def _odd_rows(relation: Relation, kernel: F64, odd: Mapping[str, Tally]) -> dict
         if one.signal == relation.x:
             found[check] = np.any([np.roll(one.rows, lag) for lag in lags], axis=0)
         else:  # the pose's motion in a row also uses the next row's pose
-            after = np.append(one.rows[1:], False) & (one.signal in (ends.POSE, ends.HEADING))
+            after = np.append(one.rows[1:], False) & (one.signal == ends.POSE)
             found[check] = one.rows | after
     return found
 
@@ -376,7 +369,7 @@ def _signals(rows: FedRows) -> Iterator[tuple[str, F64, Bools]]:
     if rows.pose is not None:
         yield ends.POSE, rows.pose[:, 0], drives
         yield ends.POSE, rows.pose[:, 1], drives
-        yield ends.HEADING, rows.pose[:, 2], turns
+        yield ends.POSE, rows.pose[:, 2], turns
     yield ends.PLAN, rows.after("near_sin"), drives | turns
     yield ends.LIDAR, rows.sectors(after=True).sum(axis=1), drives | turns
 

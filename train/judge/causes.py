@@ -23,7 +23,6 @@ from restock.train.judge.answers import (
     ACTION_TURN,
     DELAY_STEPS,
     GAIN,
-    HEADING,
     LIDAR,
     PLAN,
     POSE,
@@ -35,24 +34,17 @@ from restock.train.judge.beside import COPIED, HELD, LIMIT, PROPOSED, ROUNDED, Z
 from restock.train.judge.fed_rows import Comparison
 from restock.train.judge.mission_checks import CHOSEN
 
-GROUPS = {
-    "actions": (ACTION_SPEED, ACTION_TURN),
-    "wheels": (WHEEL_SPEED, WHEEL_TURN),
-    POSE: (POSE, HEADING),
-}
-GOALS = "PLAN_NOT_FOLLOWED"
+GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
+GOALS = "GOALS_OF_OTHERS"
 _FIRST = (  # if one of these causes is found, other checks mean nothing
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
 # Checks of a signal's values. If several are off, the first explains the others.
 OF_SIGNALS = (LIMIT, ZEROS, ROUNDED, COPIED, HELD)
 _PARTIAL = ("shifted", "scaled", "biased", "spikes")  # causes of broken stretches; first wins ties
-_LINEAR = ("opposite", "reversed", "scaled", "shifted", "biased")  # causes that a fit explains
 _UNDONE = {"opposite": "scaled", "reversed": "scaled"}  # kind of fault -> name in `Broken.mended`
 _ZEROS = {"turn": "turned", "arm": "off centre", "offset": "biased"}  # figure -> fault if not 0
-_MOUNTED = 0.2  # a turned mount keeps the length of the acceleration, up to this
 _OPPOSITE, _STILL = -0.6, 0.3  # signals with scales below these are reversed, or stand still
-_MOSTLY = 0.5  # least share of a relation's misfit that a constant fault must explain
 MENDED = 0.8  # a cause counts if at least this share of broken stretches holds once it is undone
 CHANGED = "ACTIONS_CHANGED"  # if found, the profile is not to blame for any fault of the actions
 COARSE = "ACTIONS_COARSE"  # if found, actions explain less of the motion even if all else is right
@@ -80,15 +72,12 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
     of_signals: dict[str, Comparison] = {}  # by `check`
     moved: list[Comparison] = []
     rest: list[Comparison] = []
-    fine: set[str] = set()
     for row in others:
-        if row.status == "ok":
-            fine.add(row.check)
-        elif row.off and row.check.startswith(OF_SIGNALS):
+        if row.off and row.check.startswith(OF_SIGNALS):
             of_signals[row.check] = row
         elif row.off:
             (moved if row.check.startswith(ACTION) else rest).append(row)
-    of_rows = _row_findings(rest, fine)
+    of_rows = _row_findings(rest)
     first = [one for one in of_rows if one.cause in _FIRST]
     if first:  # all else that is off may follow from these
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
@@ -106,8 +95,7 @@ def findings(answers: Sequence[Answer], others: Iterable[Comparison], task: Task
         ends = {end: off for end, off in ends.items() if end not in actions}
     if any(one.cause == GOALS for one in of_rows) and POSE not in ends:
         ends.pop(PLAN, None)  # a wrong goal explains the plan's scale
-    of_lidar = any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows)
-    if of_lidar and not _is_shift(*_distortion(LIDAR, ends.get(LIDAR, ()))):
+    if any(one.cause in ("LIDAR_OFF", "LIDAR_SHORT", "LIDAR_BLIND") for one in of_rows):
         ends.pop(LIDAR, None)  # these causes explain the lidar's relations
     follow = {check for end in (*ends, *shown) for check in TABLES.follow.get(end, ())}
     of_rows = [one for one in of_rows if one not in changed and not set(one.evidence) <= follow]
@@ -135,9 +123,8 @@ def _signal_findings(
     if POSE in by_end or POSE in odd_ends(answers):
         by_end.pop(PLAN, None)  # the plan is measured from the pose, so a wrong pose explains it
     shown, found = tuple(by_end), []
-    for group, parts in GROUPS.items():
-        if by_end.keys() >= set(parts):
-            by_end[group] = [row for part in parts for row in by_end.pop(part)]
+    if by_end.keys() >= set(GROUPS["wheels"]):
+        by_end["wheels"] = by_end.pop(WHEEL_SPEED) + by_end.pop(WHEEL_TURN)
     for end, rows in by_end.items():
         kind, row = min(rows, key=lambda one: OF_SIGNALS.index(one[0]))
         ends = GROUPS.get(end, (end,))
@@ -168,7 +155,6 @@ def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
         worth = {
             name: (
                 sum(_uses_end(one, ends) for one in left),
-                -_count_contradicting(name, [one for one in left if _uses_end(one, ends)], fine),
                 -sum(_uses_end(one, ends) for one in fine),
                 name not in GROUPS,
             )
@@ -178,28 +164,6 @@ def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
         odd[best] = [one for one in left if _uses_end(one, candidates[best])]
         left = [one for one in left if one not in odd[best]]
     return odd
-
-
-def _count_contradicting(end: str, off: Sequence[Answer], fine: Sequence[Answer]) -> int:
-    """Count the sound relations that would break if an end's scale and delay were undone."""
-    ends, (scale, steps) = GROUPS.get(end, (end,)), _distortion(end, off)
-    broken = 0
-    for one in fine:
-        is_x, is_y = one.relation.x in ends, one.relation.y in ends
-        if is_x == is_y or not scale:
-            continue
-        for row in one.comparisons:
-            if row.effect is None or not row.check.startswith(("gain", "delay")):
-                continue
-            if row.check.startswith("gain"):
-                undone = row.effect / scale if is_y else row.effect * scale
-            else:
-                undone = row.effect - steps if is_y else row.effect + steps
-            low, high = row.least, row.most
-            if (low is not None and undone < low) or (high is not None and undone > high):
-                broken += 1
-                break
-    return broken
 
 
 def _uses_end(answer: Answer, ends: tuple[str, ...]) -> bool:
@@ -235,9 +199,6 @@ def _explain_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     if all(one.holds for one in off):
         bias = named["offset"].effect or 0.0 if "offset" in named else 0.0
         kind = _constant_fault(end, scale, steps, off, named)
-        explained = [one.explained for one in off if one.explained == one.explained]
-        if kind in _LINEAR and explained and median(explained) < _MOSTLY:
-            kind = ""
         if mended and mended.get(_UNDONE.get(kind, kind), (1.0, 0.0))[0] < MENDED:
             kind = ""
     if not kind and mended:
@@ -252,10 +213,8 @@ def _explain_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     units = ((scale, ""), (gain, "the inverse of "))
     unit = [f": {inverse}{name}?" for by, inverse in units for (low, high), name in _UNITS
             if low <= by <= high]  # fmt: skip
-    turn, arm, mount = (
-        row.effect or 0.0 if (row := named.get(one)) else 0.0 for one in ("turn", "arm", "mount")
-    )
-    degrees = math.degrees(math.atan2(mount, scale) if mount else math.atan(turn))
+    turn, arm = (row.effect or 0.0 if (row := named.get(one)) else 0.0 for one in ("turn", "arm"))
+    degrees = math.degrees(math.atan(turn))
     found = TABLES.ends[kind or "unlike"].finding(
         tuple(row.check for row in rows), end=end, key=TABLES.keys[end], scale=scale,
         what="ACTIONS" if is_action else "SENSOR", scaled="COMMAND" if is_action else "SENSOR",
@@ -265,20 +224,16 @@ def _explain_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         seconds=abs(steps) * task.control_period_s, degrees=abs(degrees),
         side="left" if degrees > 0 else "right", arm=arm, bias=bias, rate=off[0].relation.unit,
         unlike="ACTIONS_MIXED" if is_action else "SENSOR_MIXED" if some else "UNLIKE_TWIN",
-        does="do" if end in ("actions", "wheels") else "does",
-        how=_describe_mismatch(end, off, named),
+        does="do" if end in GROUPS else "does", how=_describe_mismatch(end, off, named),
     )  # fmt: skip
     return replace(found, text=in_part + found.text)
 
 
 def _constant_fault(
-    end: str, scale: float, steps: float, off: Sequence[Answer], named: Mapping[str, Comparison]
+    end: str, scale: float, steps: float, off: Sequence[Answer], named: Container[str]
 ) -> str:
     """Return the kind of a fault that is the same in all rows; "" if it is not clear."""
     is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
-    if "mount" in named:  # a turned mount shows less of one axis, and as much of the other
-        length = math.hypot(scale, named["mount"].effect or 0.0)
-        return "mounted" if abs(length - 1) < _MOUNTED else ""
     if scale < 0:
         kind = "opposite" if is_action else "reversed"
         return kind if _surely_reversed(off) else ""
@@ -349,19 +304,15 @@ def _permutation(moved: Sequence[Comparison], task: Task) -> Finding:
     )
 
 
-def _row_findings(off: Sequence[Comparison], fine: Container[str]) -> list[Finding]:
-    """Return the findings of checks that imply their cause; a check counts for one finding only.
-
-    `fine` are the checks that ran and are not off.
-    """
+def _row_findings(off: Sequence[Comparison]) -> list[Finding]:
+    """Return the findings of checks that imply their cause; a check counts for one finding only."""
     left = {row.check: row for row in off}
     if "driver" in left:  # a wrong driver also explains an odd share of proposals among actions
         left = {name: row for name, row in left.items() if not name.startswith(PROPOSED)}
     found: list[Finding] = []
     for kind in TABLES.kinds:
         beside = not kind.beside or any(check in left for check in kind.beside)
-        refuted = any(check in fine for check in kind.refuted_by)
-        if kind.checks[0] in left and beside and not refuted:
+        if kind.checks[0] in left and beside:
             used = tuple(check for check in kind.checks if check in left)
             by_name = {name.replace(" ", "_"): row for name, row in left.items()}
             found.append(kind.finding(used, **by_name))
@@ -388,7 +339,6 @@ class Kind:
     remedy: str
     checks: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
-    refuted_by: tuple[str, ...] = ()
 
     def finding(self, evidence: tuple[str, ...], **known: Any) -> Finding:
         """Return the finding of this cause, with its texts filled in from `known`."""

@@ -215,7 +215,6 @@ class FedRows:
     transition_id: Ints  # (N,)
     # These are None if the rows' store is missing:
     pose: F64 | None = None  # (N, 3) on the map: x and y in m, heading in rad
-    bumped: Bools | None = None  # (N,) whether the bumper was pressed since the row before
     success: F64 | None = None  # (N,) of the row's episode; NaN if unknown
     held: NDArray[np.object_] | None = None  # (N,) pairs of sets: conditions, exposures
     driver: NDArray[np.str_] | None = None  # (N,) behaviour policy; "" if unknown
@@ -517,7 +516,6 @@ def _rows_of_ended_episodes(
         condition=_labels(conditions, chosen, episode, step),
         transition_id=np.arange(len(episode), dtype=np.int64),
         pose=np.stack([chosen["now " + name] for name in POSE], axis=1),
-        bumped=chosen["now bumped"].astype(np.bool_),
     )
 
 

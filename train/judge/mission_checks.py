@@ -41,14 +41,12 @@ from restock.train.twin.floors.layout import (
 )
 from restock.train.twin.floors.occupancy_grid import into_frame
 
-LOST, STEPS_LOST = "rows lost", "steps lost"
-NEARER = "plans followed"
+LOST = "rows lost"
+NEARER = "goals come nearer"
 AWAY = 0.05  # largest share of missions at fault
 _DRIVEN_M = 2.0  # shorter drives do not show whether a mission goes to its goal
 _SHORTER = 0.3  # a mission strays if its plan becomes shorter by less than this per metre driven
 _JUMP = 0.06  # in units of 10 m; larger changes in one step mean that the plan was replaced
-_ASIDE = 0.4  # it strays, too, if it misses waypoints by more than this, in units of `near_m`
-_LATER = 100  # steps in which a waypoint should be reached
 _STRAIGHT = 0.7  # with less distance from start to end per metre driven, a mission only wanders
 FLOOR = "floor"
 MOVED_M = 0.25
@@ -75,7 +73,7 @@ _MIN_EXPOSED = 0.2  # exposures in at least this share of a condition's episodes
 
 _SIGNALS = (
     f"SELECT t.transition_id, {', '.join(POSE)}, CAST(e.success AS DOUBLE) AS success,"
-    " t.bumped, t.conditions, t.exposures, t.behaviour_policy, h.held, r.ticks - r.episode_ends"
+    " t.conditions, t.exposures, t.behaviour_policy, h.held, r.ticks - r.episode_ends"
     " - coalesce(list_sum([one.count FOR one IN r.drops]), 0) AS written"
     " FROM transitions t SEMI JOIN fed USING (transition_id)"
     " LEFT JOIN episodes e ON e.episode_id = t.episode_id JOIN recordings r"
@@ -91,16 +89,16 @@ def with_missions(store: Store, rows: FedRows) -> FedRows:
         table = store.connection.sql(_SIGNALS, params=[rows.task.hash]).to_arrow_table()
     found = {number: place for place, number in enumerate(table["transition_id"].to_pylist())}
     at = np.array([found.get(number, -1) for number in rows.transition_id.tolist()], np.int64)
-    columns = [table[name].to_numpy().astype(np.float64) for name in table.column_names[1:6]]
-    values = np.append(np.stack(columns, axis=1), np.full((1, 5), np.nan), axis=0)[at]
+    columns = [table[name].to_numpy().astype(np.float64) for name in table.column_names[1:5]]
+    values = np.append(np.stack(columns, axis=1), np.full((1, 4), np.nan), axis=0)[at]
     held = np.empty(len(table) + 1, object)
     names = zip(table["conditions"].to_pylist(), table["exposures"].to_pylist(), strict=True)
     held[:] = [(set(a or ()), set(b or ())) for a, b in names] + [(set(), set())]
     driver = np.array([*table["behaviour_policy"].fill_null("").to_pylist(), ""])[at]
     counted = np.stack([np.append(table[name].to_numpy(), 0) for name in ("written", "held")], 1)
     return replace(
-        rows, pose=values[:, :3], success=values[:, 3], bumped=values[:, 4] == 1.0,
-        held=held[at], driver=driver, counted=counted[at],
+        rows, pose=values[:, :3], success=values[:, 3], held=held[at], driver=driver,
+        counted=counted[at],
     )  # fmt: skip
 
 
@@ -111,30 +109,24 @@ def mission_checks(
 
     `others` are the rows of the other robots or recordings, if `logs` are only a part.
     """
-    yield from _check_lost_rows(logs)
+    yield _check_lost_rows(logs)
     yield _check_goals(logs, twin)
     yield from _check_floor(logs, floors, twin)
     yield from _check_outcomes(logs)
     yield _check_driver(logs, others)
 
 
-def _check_lost_rows(rows: FedRows) -> Iterator[Comparison]:
-    """Count rows that were written and are gone, and episodes that lack steps because of it."""
+def _check_lost_rows(rows: FedRows) -> Comparison:
     what = "row that ingest wrote for a recording and that is gone"
     if rows.counted is None:
-        yield not_run(LOST, what, "no store")
-        return
+        return not_run(LOST, what, "no store")
     written, held = rows.counted[np.unique(rows.recording, return_index=True)[1]].T
-    gone = int(np.maximum(written - held, 0).sum())
-    yield share_judged(LOST, what, gone, int(written.sum()), 0.0)
-    if gone:
-        lacking = np.unique(rows.episode[~rows.joined & (rows.step > 0)])
-        what = "episode that lacks steps"
-        yield share_judged(STEPS_LOST, what, len(lacking), int(rows.last.sum()), AWAY)
+    gone = np.maximum(written - held, 0).sum()
+    return share_judged(LOST, what, int(gone), int(written.sum()), 0.0)
 
 
 def _check_goals(logs: FedRows, twin: FedRows | None) -> Comparison:
-    what = "mission that does not drive where its plan leads"
+    what = "mission drives without coming nearer to its goal"
     if logs.task.goal == "none" or logs.pose is None:
         reason = "no store with poses" if logs.pose is None else "the task has no goal"
         return not_run(NEARER, what, reason)
@@ -143,7 +135,7 @@ def _check_goals(logs: FedRows, twin: FedRows | None) -> Comparison:
 
 
 def _count_strayed(rows: FedRows) -> tuple[int, int]:
-    """Count the missions that do not drive along their plan, and those that were judged.
+    """Count the missions whose plan does not become shorter, and those that were judged.
 
     Short missions are not judged, nor those that end in a bump, which may have had no goal.
     """
@@ -160,30 +152,8 @@ def _count_strayed(rows: FedRows) -> tuple[int, int]:
         first = np.flatnonzero(np.append(True, np.diff(mission) > 0)[: len(mission)])
         ends = rows.pose[np.append(first[1:], len(mission)) - 1, :2]
         all_of_it = np.bincount(mission, driven)
-        missed = _missed_waypoints(rows) / rows.task.near_m
-        known = np.isfinite(missed)
-        aside = np.bincount(mission, known & (missed > _ASIDE))
-        strayed |= 2 * aside > np.bincount(mission, known)
         strayed &= np.hypot(*(ends - rows.pose[first, :2]).T) > _STRAIGHT * all_of_it
     return int(strayed[long].sum()), int(long.sum())
-
-
-def _missed_waypoints(rows: FedRows) -> F64:
-    """Return how far (m) from each row's near waypoint the robot drives in the rest of the mission.
-
-    (N,); NaN near the end of the plan, or if the robot does not drive so far afterwards.
-    """
-    assert rows.pose is not None
-    ahead = np.arctan2(rows.now("near_sin"), rows.now("near_cos")) + rows.pose[:, 2]
-    place, near_m = rows.pose[:, :2], rows.task.near_m
-    waypoint = place + near_m * np.stack([np.cos(ahead), np.sin(ahead)], axis=1)
-    nearest, way = np.full(len(rows), np.inf), np.zeros(len(rows))
-    for lag in range(_LATER):
-        row, known = rows.before(-lag)
-        nearest = np.fmin(nearest, np.where(known, np.hypot(*(waypoint - place[row]).T), np.nan))
-        way = np.fmax(way, np.where(known, np.hypot(*(place - place[row]).T), np.nan))
-    judged_ones = (way > near_m) & (10.0 * rows.now("goal_distance") > 2 * near_m)
-    return np.where(judged_ones, nearest, np.nan)
 
 
 def _check_floor(
@@ -278,14 +248,7 @@ def _check_ranges(
     what = "range of the lidar less the distance to the floor's racks and walls"
     yield judged(RANGES, what, "difference", middle, logs=middle.value, twin=0.0, least=-RANGE_M,
                  most=RANGE_M, logs_rows=len(kept))  # fmt: skip
-
-    def lost(shown: Bools) -> Bools:  # looks that mostly do not see what should be near the pose
-        return np.asarray((alike & shown).sum(axis=1) < shown.sum(axis=1) / 2, np.bool_)
-
     looked, seen = plain.sum(axis=0), (alike & plain).sum(axis=0)
-    if lost(plain & (seen >= looked / 2)).mean() > AWAY:  # not the sectors: the pose is elsewhere
-        placed = plain & ~lost(plain)[:, None]
-        looked, seen = placed.sum(axis=0), (alike & placed).sum(axis=0)
     blind, judged_ones = seen < looked / 2, looked >= _MIN_LOOKS
     bearings = (np.flatnonzero(blind & judged_ones) + 0.5) * 360 / rows.task.sectors - 180
     what = "sector that mostly does not see the floor's racks and walls"
@@ -293,11 +256,9 @@ def _check_ranges(
                        note=", ".join(f"{one:+.0f}" for one in bearings))  # fmt: skip
     plain &= ~blind
     mission = np.unique(rows.episode[kept], return_inverse=True)[1].reshape(-1)
-    middle_step = np.bincount(mission, rows.step[kept]) / np.bincount(mission)
-    half = 2 * mission + (rows.step[kept] > middle_step[mission])
-    looked, seen = (np.bincount(half, one.sum(axis=1)) for one in (plain, alike & plain))
+    looked, seen = (np.bincount(mission, one.sum(axis=1)) for one in (plain, alike & plain))
     blind, judged_ones = seen < looked / 2, looked >= _MIN_LOOKS
-    what = "half of a mission in which the lidar mostly does not see the racks where they are"
+    what = "mission in which the lidar mostly does not see the floor's racks where they are"
     yield share_judged(ON_RACKS, what, int((blind & judged_ones).sum()), int(judged_ones.sum()),
                        AWAY)  # fmt: skip
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 
@@ -18,15 +17,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.store.transitions import label_table
 from restock.ingest.task.conditions import Condition, label
-from restock.ingest.task.task import (
-    STORED_SIGNALS,
-    Signals,
-    nearest_action,
-    observe,
-    reward,
-    reward_parts,
-    terminated,
-)
+from restock.ingest.task.task import STORED_SIGNALS, Signals, reward_parts, terminated
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 from restock.stats import (
@@ -47,12 +38,7 @@ from restock.train.judge.fed_rows import (
     shares_compared,
     unflagged,
 )
-from restock.train.twin.calibration.logged_steps import (
-    COMMAND,
-    LoggedSteps,
-    logged_steps,
-    rows_of,
-)
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
 MOST = 0.005  # largest share of rows that may be off; by definition, none should be
 _EQUAL = 1e-4
@@ -121,9 +107,7 @@ def _differ(first: F32, second: F32) -> Bools:
 SCALE = 1.05  # largest ratio of rewards to the task's own, either way
 OTHER = 0.05  # largest share of rows with another reward than the task's own
 LOST = 0.05  # largest share of ends of episodes that may be wrong
-UNCAUSED, UNTOUCHED = "terminated without cause", "bumps without contact"
-EARLY = "ends before the goal"
-_FREE_M = 0.25  # with at least this clearance, nothing was touched
+UNCAUSED = "terminated without cause"
 _JUMP_M = 0.9  # larger changes in one step mean that the plan was replaced
 _TOUCHING_M = 0.05
 _MIN_REWARD = 0.05  # rewards and errors below this may be noise of float32 and clearances
@@ -174,7 +158,6 @@ def outcomes(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
     """Check rewards, then terminations."""
     yield from _check_rewards(logs, twin)
     yield from _check_terminations(logs, twin)
-    yield _check_bumps(logs, twin)
 
 
 def _check_rewards(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
@@ -225,18 +208,6 @@ def _check_terminations(logs: FedRows, twin: FedRows | None) -> Iterator[Compari
             yield not_run(check, "what happens on arrival", "the task has no goal")
         return
 
-    def early(rows: FedRows) -> tuple[int, int]:
-        earned = rows.terminated & rows.last & (rows.reward > weight.goal / 2)
-        return int((earned & ~arrived(rows)).sum()), int(earned.sum())
-
-    what = "episode that ends with a goal's reward while its plan goes on"
-    earned = logs.terminated & logs.last & (logs.reward > weight.goal / 2) & ~arrived(logs)
-    to_go = 10.0 * float(np.median(logs.after("goal_distance")[earned])) if earned.any() else 0.0
-    if twin is None:
-        yield not_run(EARLY, what, "no twin to compare with")
-    else:
-        yield shares_compared(EARLY, what, early(logs), early(twin), -1.0, LOST, f"{to_go:.2g} m")
-
     def at_goal(rows: FedRows) -> tuple[int, int]:
         there = arrived(rows) & rows.last
         return int((rows.terminated & there).sum()), int(there.sum())
@@ -249,20 +220,6 @@ def _check_terminations(logs: FedRows, twin: FedRows | None) -> Iterator[Compari
     else:
         yield share_judged("terminated at the goal", what, *at_goal(logs), 1.0, least=1 - LOST)
     yield _goal_reward(logs, twin)
-
-
-def _check_bumps(logs: FedRows, twin: FedRows | None) -> Comparison:
-    """Count rows in which the bumper is pressed and the lidar sees nothing near."""
-    what = "bumper is pressed, and the lidar sees nothing near"
-    if logs.bumped is None or not logs.task.lidar or twin is None:
-        return not_run(UNTOUCHED, what, "there is no store, no lidar or no twin")
-
-    def untouched(rows: FedRows) -> tuple[int, int]:
-        pressed = np.zeros(len(rows), np.bool_) if rows.bumped is None else rows.bumped
-        nearest = rows.sectors().min(axis=1) ** 2 * rows.task.range_max_m
-        return int((pressed & (nearest > _FREE_M)).sum()), int(pressed.sum())
-
-    return shares_compared(UNTOUCHED, what, untouched(logs), untouched(twin), -1.0, LOST)
 
 
 def _goal_reward(logs: FedRows, twin: FedRows | None) -> Comparison:
@@ -422,13 +379,6 @@ DIFFERENT = 0.02  # largest share of wrong labels among rows that have, or shoul
 _LABELS = "row's label differs from what its conditions give on the stored signals"
 _FED = "row's label in the panel differs from that in its store"
 _ENDS = "termination of the row does not agree with its signals"
-_REWARD = "row's reward differs from what the task gives on the stored signals"
-_ACTION = "row's action is not the nearest one to its stored command"
-_OBSERVATION = "row's observation differs from what its stored signals give"
-_END = "row ends its episode, where the recording goes on, or the other way round"
-_STAMP = "row's stamp is not one control period before the next, or before its pose's stamp"
-_LATE = 0.5  # share of the control period by which stamps may differ from it
-_EXACT = 5e-3  # largest difference of a value that is computed again from float32
 
 
 def stored(
@@ -448,7 +398,7 @@ def stored(
     steps = logged_steps(store, rows.task.hash, recordings)
     whole = _in_whole_episodes(steps)
     yield from _check_labels(steps, whole, profile.shown_by_logs(conditions), left_out)
-    yield from _check_recomputed(steps, rows)
+    yield _check_stored_terminations(steps, rows)
 
 
 def fed_labels(store: Store, rows: FedRows) -> Iterator[Flags]:
@@ -546,41 +496,12 @@ def _check_labels(
         )  # fmt: skip
 
 
-def _check_recomputed(steps: LoggedSteps, rows: FedRows) -> Iterator[Flags]:
-    """Compare terminations, rewards, actions and observations with those of the stored signals."""
+def _check_stored_terminations(steps: LoggedSteps, rows: FedRows) -> Flags:
     place = {number: index for index, number in enumerate(rows.transition_id.tolist())}
     at = np.array([place.get(number, -1) for number in steps.transition_id.tolist()], np.int64)
-    here = np.flatnonzero(at >= 0)
-    ended = rows.terminated[at[here]] | rows.truncated[at[here]]
-    really = np.isin(here, steps.ending)
-    last = np.append(steps.episode_id[1:] != steps.episode_id[:-1], True)[here]
-    off = (ended != really) | (last != really)
-    yield Flags("ends", _END, steps.transition_id[here], off, DIFFERENT / 10)
-    known = here[steps.followed[here]]
-    now, after, row = rows_of(steps.now, known), rows_of(steps.after, known), at[known]
-    task, ids = steps.task, steps.transition_id[known]
-    again, stored_ends = terminated(task, after), rows.terminated[row]
+    known = steps.followed & (at >= 0)
+    again = terminated(steps.task, rows_of(steps.after, np.flatnonzero(known)))
+    stored_ends = rows.terminated[at[known]]
     either = again | stored_ends
-    yield Flags("terminations", _ENDS, ids[either], (again != stored_ends)[either], DIFFERENT)
-    if not task.reward_terms:
-        progress_m, before = steps.progress_m[known], rows.previous_action()[row]
-        own = reward(task, now, after, progress_m, rows.action[row], before)
-        yield Flags("rewards", _REWARD, ids, np.abs(own - rows.reward[row]) > _EXACT, DIFFERENT)
-    elapsed_s = (after["stamp_ns"] - now["stamp_ns"]) * 1e-9
-    wrong = np.abs(elapsed_s - task.control_period_s) > _LATE * task.control_period_s
-    wrong |= now["pose_stamp_ns"] > now["stamp_ns"]
-    yield Flags("stamps", _STAMP, ids, wrong, DIFFERENT)
-    command = [now[name] for name in COMMAND]
-    away = nearest_action(task, *command)[1]
-    given = np.stack(command, axis=1) / np.abs(task.actions).max(axis=0).clip(1e-9)
-    own_away = np.linalg.norm(given - task.scaled_actions[rows.action[row]], axis=1)
-    yield Flags("actions", _ACTION, ids, own_away > away + _EXACT, DIFFERENT)
-    thin = msgspec.structs.replace(
-        task, sectors=0, tracks=msgspec.UNSET, observed=msgspec.UNSET
-    )  # their entries do not follow from the stored signals
-    clear = {"sector_clearance_m": np.zeros((len(known), 0))}
-    seen = observe(thin, now | clear, clear, rows.previous_action()[row])
-    entries = [task.observation_names.index(name) for name in thin.observation_names]
-    off = ~(np.abs(seen - rows.observation[row][:, entries]) <= _EXACT * (1 + np.abs(seen)))
-    named = np.array(thin.observation_names)[np.argsort(-off.sum(axis=0), kind="stable")][:3]
-    yield Flags("observations", _OBSERVATION, ids, off.any(axis=1), DIFFERENT, ", ".join(named))
+    off = (again != stored_ends)[either]
+    return Flags("terminations", _ENDS, steps.transition_id[known][either], off, DIFFERENT)
