@@ -153,7 +153,7 @@ def _found(samples: pa.Table, signals: pa.Table) -> dict[str, float]:
             "CREATE TABLE episode_conditions (robot TEXT, site TEXT, recording_id TEXT, zone TEXT,"
             " episode_id TEXT, start_time TIMESTAMP, condition TEXT, driven_h DOUBLE, events INT)"
         )
-        connection.execute(definitions(["drift.sql"]))
+        connection.execute(definitions(names=["drift.sql"]))
         rows = connection.sql(
             f"SELECT avg((p < {CORRECTED} AND size >= 1)::INT), avg((p < .05)::INT), count(p)"
             " FROM drift_by() WHERE against = 'own reference' AND period = DATE '2026-03-23'"

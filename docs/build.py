@@ -77,7 +77,6 @@ def list_views() -> Iterator[str]:
         HELD_CONDITIONS,
         definitions,
         install_columns,
-        script,
         view_docs,
     )
 
@@ -85,8 +84,7 @@ def list_views() -> Iterator[str]:
         connection.register("stored_transitions", transition_schema(2).empty_table())
         connection.register("stored_recordings", recording_schema().empty_table())
         connection.register("stored_frames", frame_schema().empty_table())
-        connection.execute(script(summaries=False))
-        connection.execute(definitions([FRAMES_SQL]))
+        connection.execute(definitions("FLOAT[]") + definitions(names=[FRAMES_SQL]))
         install_columns(connection)
         rows = connection.sql("FROM columns").fetchall()
     for view, doc in view_docs().items():

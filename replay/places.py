@@ -329,7 +329,7 @@ def _add_returns(connection: duckdb.DuckDBPyConnection, file: Path, schema: str)
     """Create the views `driven_episodes` and `returns` if evaluations have discounted returns."""
     if "discounted_return" not in pq.read_schema(file).names:
         return
-    connection.execute(definitions(["return_order.sql"]))
+    connection.execute(definitions(names=("return_order.sql",)))
     text = resources.files("restock.replay.store").joinpath("run_returns.sql").read_text("utf-8")
     connection.execute(text.replace("{schema}", schema))
 

@@ -1,5 +1,5 @@
 -- Steps per episode, zone and condition at which the condition holds, and at how many of them it began.
--- From `transitions`. For the summary in a recording's manifest, or a view, as zone_steps.sql.
+-- From `transitions`. Included in the same two statements as zone_steps.sql.
 SELECT
     recording_id,
     episode_id,

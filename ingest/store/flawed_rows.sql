@@ -1,5 +1,5 @@
 -- Rows with NaN or infinite values, which would break a network, or without a required value. From
--- `transitions`. For the summary in a recording's manifest, or a view, as zone_steps.sql.
+-- `transitions`. Included in two statements: the view that scans rows, and the summary in a manifest.
 SELECT transition_id, recording_id, episode_id, step_index, is_null, is_not_finite
 FROM (
     SELECT

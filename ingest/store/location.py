@@ -335,6 +335,24 @@ class Location:
             read = [name for name in names if columns is None or name in columns]
             return with_plain_text(whole.read(read))
 
+    def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Yield a Parquet file's rows, one row group at a time, with those columns that it has.
+
+        `list.field` reads only that field of a list of structs. Raises as `read` does.
+        """
+
+        def is_requested(leaf: str) -> bool:
+            # The parts of the path between a list and its field depend on the file's writer.
+            names = leaf.split(".")
+            return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
+
+        with self.reading(path) as file:
+            whole = open_parquet(file)
+            leaves = [whole.schema.column(number).path for number in range(len(whole.schema))]
+            read = [leaf for leaf in leaves if is_requested(leaf)]
+            for group in range(whole.num_row_groups):
+                yield with_plain_text(whole.read_row_group(group, read))
+
     def read_schema(self, path: str) -> pa.Schema:
         """Read a Parquet file's schema, with its metadata. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:

@@ -1,7 +1,7 @@
 -- The values in which drift is searched: one per episode and signal, with the number of steps that it is
 -- computed from. A signal has no row if the robot lacks its sensor. Values that describe the robot leave
--- out slipping steps. From `transitions` and `recordings`. For the summary in a recording's manifest, or a view,
--- as zone_steps.sql. A profile's own signals are in measured_custom_signals.sql.
+-- out slipping steps. From `transitions` and `recordings`. Included in two statements: the view that scans
+-- rows, and the summary in a manifest. A profile's own signals are in measured_custom_signals.sql.
 WITH tasks AS (
     SELECT
         task_hash,

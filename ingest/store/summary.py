@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -255,12 +256,17 @@ def _query(name: str) -> str:
     return with_included(f"-- include: {name}.sql")
 
 
-def with_included(text: str) -> str:
-    """Replace each `-- include: FILE.sql` in SQL by that file of this folder."""
+def with_included(text: str, beside: Traversable | None = None) -> str:
+    """Replace each `-- include: FILE.sql` in SQL by that file, which several statements share.
+
+    Files are looked up in this folder, then in the folder `beside`.
+    """
 
     def included(named: re.Match[str]) -> str:
-        path = files("restock.ingest.store") / named[1]
-        return with_included(path.read_text(encoding="utf-8"))
+        folder = files("restock.ingest.store")
+        if beside is not None and not (folder / named[1]).is_file():
+            folder = beside
+        return with_included((folder / named[1]).read_text(encoding="utf-8"), beside)
 
     return re.sub(r"-- include: (\w+\.sql)", included, text)
 

@@ -1,6 +1,6 @@
 -- Summary tables of a recording, from its `transitions` and its manifest (`recordings`). The manifest stores
--- them, and the views of a store add them up. If another tool changed rows of a store, it has these statements
--- as views over all its rows. Tables that need only one episode at a time (measured_signals, flawed_rows,
+-- them, and summaries.sql adds them up over the store. Cells are counted as in views.sql, which scans the
+-- rows: a test compares both. Tables that need only one episode at a time (measured_signals, flawed_rows,
 -- zone_steps, condition_steps) have their own files and are computed some episodes at a time.
 CREATE TEMP TABLE steps AS
 SELECT
@@ -32,31 +32,7 @@ SELECT
     max(stamp_ns) AS end_ns,
     count(*) AS steps,
     CAST(max(step_index) - min(step_index) + 1 - count(*) AS BIGINT) AS missing_steps,
-    sum(reward) AS return,
-    CASE
-        WHEN bool_or(terminated) THEN 'terminated'
-        WHEN bool_or(truncated) THEN 'truncated'
-        ELSE 'open'
-    END AS ended,
-    -- An episode ends by the goal's reward, or by a bump.
-    CASE
-        WHEN any_value(has_goal) AND bool_or(terminated AND reward > goal_reward / 2) THEN 'goal'
-        WHEN bool_or(terminated) THEN 'bump'
-    END AS ended_by,
-    CASE WHEN any_value(has_goal) THEN coalesce(any_value(goal_source), 'logged') END AS goal_source,
-    -- Goals set in hindsight are always reached, so they do not count as success.
-    CASE WHEN any_value(has_goal) AND coalesce(any_value(goal_source), 'logged') = 'logged'
-        THEN bool_or(terminated AND reward > goal_reward / 2)
-            AND NOT bool_or(bumped AND step_index > 0)
-    END AS success,
-    sum(progress_m) AS progress_m,
-    count(*) FILTER (WHERE bumped) AS bumped_steps,
-    min(clearance_m) AS clearance_min_m,
-    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
-    list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
-    arg_min(behaviour_policy, step_index) AS first_policy,
-    count(*) FILTER (WHERE handover) AS handovers,
-    list_sort(list(DISTINCT zone)) AS zones
+    -- include: episode_columns.sql
 FROM steps
 GROUP BY episode_id
 ORDER BY min(step_index), episode_index;

@@ -65,7 +65,7 @@ from restock.replay.plan.strata import (
     resolve_strata,
 )
 from restock.replay.plan.weights import RatioFit
-from restock.replay.store.definitions import ROWS, definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import parquet_view
 from restock.replay.store.store import Store
 
@@ -164,7 +164,7 @@ def _create_views(
             )
     for table, parts in tables.items():
         connection.execute(f"CREATE VIEW {table} AS " + " UNION ALL BY NAME ".join(parts))
-    connection.execute(definitions([ROWS]))
+    connection.execute(definitions(names=["rows.sql"]))
     return repeated
 
 

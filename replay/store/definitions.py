@@ -13,16 +13,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.resources import files
-from textwrap import dedent
 from typing import Protocol
 from weakref import WeakKeyDictionary, ref
 
 import duckdb
 import pyarrow as pa
 
-from restock.ingest.store.summary import BY_EPISODE, TABLES, with_included
+from restock.ingest.store.summary import with_included
 from restock.ingest.task.schema import COLUMNS, FRAME_COLUMNS, RECORDING_COLUMNS
 from restock.process import was_interrupted
+from restock.replay.store.same_drives import install_same_drives
 
 HELD_CONDITIONS = "held_conditions"  # view with the columns of `transitions`, and `condition`
 
@@ -125,25 +125,25 @@ def _read_docs() -> dict[str, dict[str, str]]:
 
 
 # In this order: a view may use earlier ones.
-ROWS = "rows.sql"
-VIEWS = (ROWS, "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
+VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
 FRAMES_SQL = "frames.sql"  # reads stored_frames, which exists only on a store's own connection
 MACROS = (
     "macros.sql",
+    "flawed_rows.sql",
+    "recording_conditions.sql",
     "capacity.sql",
+    "shared_rows.sql",
     "repeated_rows.sql",
-    "same_drives.sql",
     "corrections.sql",
+    "measured_signals.sql",
     "episode_signals.sql",
     "drift.sql",
     "return_order.sql",
     "returns.sql",
 )
-SHARED_ROWS = "shared_rows.sql"
-# Views that are computed once, when a query names one of these: the view, or macros that use it.
-KEPT = (("shared_rows", "repeated_rows", "same_steps"), ("same_drives",))
+SUMMARIES = "summaries.sql"  # replaces views of the same names if all manifests have summaries
 # Files whose views `Store.connection` always has, for callers that do not use `install_named`.
-COMMON = (ROWS, "views.sql", "labels.sql", "corrections.sql")
+COMMON = ("rows.sql", "views.sql", "labels.sql", "corrections.sql")
 # Views that `rows_held` copies into memory. HELD_OF_MANY: few rows from a scan of many, copied in
 # any store if several queries use them. HELD: views that others read, copied in stores of few rows,
 # as DuckDB binds tables ten times faster and reads their columns once. HELD_SUMMARIES: copied
@@ -188,8 +188,8 @@ class Definitions:
 
     Args:
         connection: the store's connection.
-        summaries: whether summaries of recordings are read from `stored_summaries`, and not
-            computed from rows.
+        observation_type: DuckDB type that observations are cast to.
+        summaries: whether the common views read `stored_summaries` instead of rows.
         tables: name of a `stored_…` table -> function that creates it when a query needs it.
         replaced: names of views -> function that replaces them by tables when a query names one;
             this takes too long to do when a query only lists views.
@@ -201,6 +201,7 @@ class Definitions:
     def __init__(
         self,
         connection: duckdb.DuckDBPyConnection,
+        observation_type: str,
         *,
         summaries: bool = False,
         tables: Mapping[str, Callable[[], None]] | None = None,
@@ -208,16 +209,14 @@ class Definitions:
     ) -> None:
         self._tables = dict(tables or {})
         self._connection, self.summaries = connection, summaries
-        names = (*VIEWS, FRAMES_SQL, *MACROS)
-        self._statements = {
-            **_statements(_read_store_sql(names)),
-            **_statements(summary_views(summaries=summaries)),
-        }
+        self._statements = dict(
+            _statements(_read_store_sql(observation_type, (*VIEWS, FRAMES_SQL, *MACROS)))
+        )
+        if summaries:
+            self._statements |= _statements(definitions(names=[SUMMARIES]))
         self.computed: dict[tuple[str, ...], Callable[[], None]] = {}
-        self._replaced: dict[tuple[str, ...], Callable[[], None]] = {
-            **(replaced or {}),
-            **{names: partial(self._keep, names[0]) for names in KEPT},
-        }
+        self._replaced: dict[tuple[str, ...], Callable[[], None]] = dict(replaced or {})
+        self._replaced[("same_drives",)] = partial(install_same_drives, connection)
         self.made: set[str] = set()
         self._held: list[str] = []
         _DEFINITIONS[connection] = ref(self)
@@ -236,7 +235,7 @@ class Definitions:
 
     def make_common(self) -> None:
         """Create the common views, COMMON."""
-        self._make(_statements(definitions(COMMON)))
+        self._make(_statements(definitions(names=COMMON)))
 
     def make_all(self) -> None:
         """Create all views and macros, and the view `columns`, which lists their columns."""
@@ -269,13 +268,6 @@ class Definitions:
         for other in sorted(_named_in(self._statements[name])):
             self._follow(other, order, seen)
         order[name] = None
-
-    def _keep(self, view: str) -> None:
-        """Replace a view by a table of its rows."""
-        self._connection.execute(
-            f"CREATE TABLE stored_{view} AS FROM {view};"
-            f" CREATE OR REPLACE VIEW {view} AS FROM stored_{view}"
-        )
 
     def hold(self, views: Sequence[str]) -> None:
         """Replace these views by tables of their rows; `release` restores the views."""
@@ -390,66 +382,17 @@ def install_all(connection: duckdb.DuckDBPyConnection) -> bool:
     return maker is not None
 
 
-def install_common(connection: duckdb.DuckDBPyConnection) -> None:
+def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
     """Create the views of COMMON in the current schema, which must have a store's tables."""
-    text = f"{summary_views(summaries=False)}\n{_read_store_sql(COMMON)}"
-    connection.execute("\n".join(_statements(text).values()))
+    connection.execute("\n".join(_statements(_read_store_sql(observation_type, COMMON)).values()))
 
 
-def definitions(names: Sequence[str]) -> str:
-    """Return the SQL of these files."""
+def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
+    """Return the SQL of these files, which casts observations to this type."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    return with_included("\n".join(text))
-
-
-def summary_views(*, summaries: bool) -> str:
-    """Return the SQL of the tables of recordings' summaries as views over all recordings.
-
-    They read `stored_summaries`, or else compute the same from all rows by the queries of ingest.
-    A table has its own name if it is in BY_EPISODE, else `stored_NAME`. Of the distinctive rows,
-    the view `shared_rows` has those that are in several recordings.
-    """
-    if not summaries:
-        return _views_of_rows()
-    views = [
-        f"CREATE OR REPLACE VIEW {name if name in BY_EPISODE else f'stored_{name}'} AS"
-        " SELECT recording_id, one.*"
-        f" FROM (SELECT ingest_id, unnest({name}) AS one FROM stored_summaries)"
-        " JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);"
-        for name in TABLES
-    ]
-    shared = """
-        CREATE OR REPLACE VIEW shared_rows AS
-        SELECT recording_id, transition_id, content
-        FROM stored_distinctive_rows
-        SEMI JOIN (SELECT content FROM stored_distinctive_rows GROUP BY ALL HAVING count(*) > 1)
-            USING (content);
-    """
-    return "\n".join([*views, dedent(shared)])
-
-
-def _views_of_rows() -> str:
-    """Return `summary_views` that compute summaries from all rows."""
-    queries = {name: with_included(f"-- include: {name}.sql") for name in BY_EPISODE}
-    custom = with_included("-- include: measured_custom_signals.sql")
-    own = queries["measured_signals"]
-    queries["measured_signals"] = f"(\n{own}\n) UNION ALL BY NAME (\n{custom}\n)"
-    views = [
-        f"CREATE OR REPLACE VIEW {name} AS SELECT recording_id, * EXCLUDE (recording_id)"
-        f" FROM (\n{query}\n);"
-        for name, query in queries.items()
-    ]
-    tables = with_included("-- include: summary.sql").replace("TEMP TABLE", "OR REPLACE VIEW")
-    made = "|".join(re.findall(r"^CREATE OR REPLACE VIEW (\w+)", tables, re.MULTILINE))
-    tables = re.sub(rf"\b(FROM|VIEW) ({made})\b", r"\1 stored_\2", tables)
-    return "\n".join([tables, *views, definitions([SHARED_ROWS])])
-
-
-def script(*, summaries: bool) -> str:
-    """Return the SQL that creates all views and macros of a store, but those of camera frames."""
-    rest = definitions((*VIEWS[1:], *MACROS))
-    return "\n".join([definitions([ROWS]), summary_views(summaries=summaries), rest])
+    whole = with_included("\n".join(text), folder)
+    return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 
 def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
@@ -457,7 +400,7 @@ def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
     if connection in _DEFINITIONS:
         install_named(connection, "repeated_rows")
     else:
-        connection.execute(definitions([SHARED_ROWS, "repeated_rows.sql"]))
+        connection.execute(definitions(names=["shared_rows.sql", "repeated_rows.sql"]))
 
 
 def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
@@ -470,14 +413,14 @@ def install_novelty(connection: duckdb.DuckDBPyConnection) -> None:
         connection.register("novelty", read_novelty(connection))
 
 
-def _read_store_sql(names: Sequence[str]) -> str:
-    text = definitions(names)
+def _read_store_sql(observation_type: str, names: Sequence[str]) -> str:
+    text = definitions(observation_type, names)
     return text.replace(_INGESTS, _INGESTS.replace("transitions", "ingests"))
 
 
 def names_created_in(name: str) -> list[str]:
     """Return the names of the views and macros that an SQL file creates."""
-    return list(_statements(definitions([name])))
+    return list(_statements(definitions(names=[name])))
 
 
 @cache

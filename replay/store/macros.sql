@@ -1,4 +1,15 @@
--- Table macros, for example: FROM ages_at('2026-12-01');
+-- Table macros, for example: FROM cells_below(100);
+
+-- Condition x action cells with fewer than `minimum` rows, including empty cells.
+CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
+FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
+CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
+LEFT JOIN (SELECT condition, action, count(*) AS rows FROM held_conditions GROUP BY ALL)
+    USING (condition, action)
+ANTI JOIN untold_conditions USING (condition)
+WHERE coalesce(rows, 0) < minimum
+ORDER BY condition, action;
 
 -- Age of each condition's rows at a moment, in days.
 CREATE OR REPLACE MACRO ages_at(moment) AS TABLE
@@ -33,24 +44,16 @@ ORDER BY step_index;
 
 -- The kind of each episode: the condition that held longest (if equally long, the first by name) among those
 -- that held for at least `min_steps` steps, else nominal. True conditions are used in rows that have them.
--- Rows are read only if they have a true condition; rows of a fleet's logs have none.
 CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
-WITH told AS (
-    SELECT DISTINCT episode_id FROM transitions WHERE true_condition IS NOT NULL
-), held AS (
-    SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind, 1 AS steps
+WITH held AS (
+    SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind
     FROM transitions
     WHERE true_condition IS NOT NULL AND true_condition <> 'nominal'
     UNION ALL
-    SELECT episode_id, unnest(conditions), 1
-    FROM transitions
-    SEMI JOIN told USING (episode_id)
-    WHERE true_condition IS NULL
-    UNION ALL
-    SELECT episode_id, condition, steps FROM condition_steps ANTI JOIN told USING (episode_id)
+    SELECT episode_id, unnest(conditions) FROM transitions WHERE true_condition IS NULL
 ), longest AS (
     SELECT episode_id, first(kind ORDER BY steps DESC, kind) AS kind
-    FROM (SELECT episode_id, kind, sum(steps) AS steps FROM held GROUP BY ALL HAVING sum(steps) >= min_steps)
+    FROM (SELECT episode_id, kind, count(*) AS steps FROM held GROUP BY ALL HAVING count(*) >= min_steps)
     GROUP BY episode_id
 )
 SELECT episode_id, coalesce(kind, 'nominal') AS kind, success, return, first_policy

@@ -225,6 +225,17 @@ class StoredTable:
                 remedy=damage_remedy(self.place, self.table),
             ) from error
 
+    def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Yield the rows of each row group; `columns` are as for `Location.row_groups`.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        for path in self.paths:
+            place = f"{self.table}/{path}"
+            with damage_named(self.place, place):
+                yield from self.place.row_groups(place, columns)
+
     def _dataset(self) -> pa.Table | Dataset:
         if not self.paths:
             return self.schema.empty_table()

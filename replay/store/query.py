@@ -21,7 +21,9 @@ from restock.replay.store.parquet_views import damage
 T = TypeVar("T")
 
 # DuckDB's suggestion of an internal table for a misspelt name, which is never what was meant.
-_OWN_TABLE = re.compile(r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information|stored)_[^"]*"\?')
+_OWN_TABLE = re.compile(
+    r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information|stored_\d+)_[^"]*"\?'
+)
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that change no files; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}

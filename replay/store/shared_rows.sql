@@ -1,6 +1,6 @@
 -- Rows whose content is unique in their recording and also in another recording. The content is a hash of task,
 -- action, observation and pose, rounded to a thousandth; stamps do not count, as each ingest estimates its own
--- clock. This view scans the rows; if manifests have the hashes, `summary_views` reads only those.
+-- clock. This view scans the rows; if manifests have the hashes, same_drives.py reads only those.
 CREATE OR REPLACE VIEW shared_rows AS
 WITH places AS (
     -- Hashes of task, action and pose that are in several recordings: only their rows are read whole.

@@ -43,9 +43,9 @@ from restock.process import interrupts_raised
 from restock.replay.store.definitions import (
     FRAMES_SQL,
     Definitions,
+    definitions,
     install_common,
     names_created_in,
-    script,
 )
 from restock.replay.store.parquet_views import (
     StoredTable,
@@ -56,6 +56,7 @@ from restock.replay.store.parquet_views import (
     register,
 )
 from restock.replay.store.query import query
+from restock.replay.store.same_drives import SHARED, install_shared_rows
 
 # With these optimizers disabled, joins run as written, with the right side in memory. DuckDB
 # estimates one row for each scan of files with given columns, so it would choose to hold all
@@ -150,14 +151,18 @@ class Store:
                 " replaced: name a newer version, or restore them from a copy",
             ) from error
         self._tasks = self._read_tasks()
+        self.observation_type = self._observation_type()
+        summaries = self._has_summaries()
         self._definitions = Definitions(
             self.bare,
-            summaries=not self.changed_by_others,
+            self.observation_type,
+            summaries=summaries,
             tables={
                 "stored_transitions": partial(self._present_rows, self.bare, "main"),
                 "stored_summaries": partial(self._summaries.present, self.bare),
             },
-            replaced={("novelty",): self._install_novelty},
+            replaced={("novelty",): self._install_novelty}
+            | ({SHARED: self._install_shared_rows} if summaries else {}),
         )
 
     def __enter__(self) -> Store:
@@ -331,6 +336,18 @@ class Store:
         ).fetchall()
         return dict(rows)
 
+    def _observation_type(self) -> str:
+        """Return `FLOAT[size]` if all tasks have observations of one size, else `FLOAT[]`.
+
+        The size is unknown for tasks of another version of Restock.
+        """
+        tasks = {name: self._decode(text, Task, "task") for name, text in self._tasks.items()}
+        sizes = {
+            task.observation_size if task.hash == name else None for name, task in tasks.items()
+        }
+        size = sizes.pop() if len(sizes) == 1 else None
+        return f"FLOAT[{size}]" if size else "FLOAT[]"
+
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """Create this store's common views in a new schema of a connection to several stores.
 
@@ -343,7 +360,7 @@ class Store:
         try:
             self._present_manifests(connection, schema)
             self._present_rows(connection, schema)
-            install_common(connection)
+            install_common(connection, self.observation_type)
         finally:
             connection.execute("USE main")
 
@@ -360,6 +377,19 @@ class Store:
             column = pa.array(counts, self._manifests[place].type)
             self._manifests = self._manifests.set_column(place, "transitions", column)
         return sorted(changed)
+
+    def _has_summaries(self) -> bool:
+        """Return whether each ingest has a manifest, and no other tool has changed rows."""
+        manifests = set(self._manifests["ingest_id"].to_pylist())
+        held = self._ingests["ingest_id"].to_pylist()
+        return bool(held) and not self.changed_by_others and manifests.issuperset(held)
+
+    def _install_shared_rows(self) -> None:
+        """Replace the view `shared_rows`, which scans rows, by a table computed from manifests."""
+        held = self._ingests.to_pylist()
+        recordings = {one["ingest_id"]: one["recording_id"] for one in held}
+        rows = sum(one["rows"] for one in held)
+        install_shared_rows(self.bare, self._summaries.row_groups, recordings, rows)
 
     def _install_novelty(self) -> None:
         """Replace the view `novelty`, which is all null, by a table of measured values."""
@@ -493,8 +523,7 @@ def init_script(store: Store) -> str:
                 parquet_view(view, [Path(file).absolute() for file in files]) + ";"
                 for view, files in store.files.items()
             ),
-            "CREATE OR REPLACE VIEW stored_summaries AS FROM stored_recordings;",
-            script(summaries=not store.changed_by_others),
+            definitions(store.observation_type),
             f"CREATE OR REPLACE VIEW columns AS FROM (VALUES {columns})"
             ' AS columns ("view", "column_name", "type", "unit", "meaning");',
             "",

@@ -1,5 +1,4 @@
--- The views of a store, over its `recordings` and `transitions` (rows.sql), and the tables of recordings'
--- summaries (stored_cells, …: `summary_views` in definitions.py).
+-- The views of a store, over its `recordings` and `transitions` (rows.sql).
 -- columns.toml documents every column (those of `transitions` and `recordings`: ingest/task/schema.py), which
 -- a test checks.
 
@@ -105,43 +104,43 @@ SELECT transition_id, CAST(NULL AS FLOAT) AS novelty, CAST(NULL AS BOOLEAN) AS n
 FROM transitions;
 
 CREATE OR REPLACE VIEW episodes AS
-SELECT
-    recording_id,
-    episode_id,
-    episode_index,
-    task_hash,
-    start_ns,
-    end_ns,
-    make_timestamp(start_ns // 1000) AS start_time,
-    make_timestamp(end_ns // 1000) AS end_time,
-    make_timestamp((start_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_start_time,
-    make_timestamp((end_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_end_time,
-    steps,
-    missing_steps,
-    (end_ns - start_ns) / 1e9 AS duration_s,
-    return,
-    ended,
-    ended_by,
-    goal_source,
-    success,
-    progress_m,
-    bumped_steps,
-    clearance_min_m,
-    conditions,
-    behaviour_policies,
-    first_policy,
-    handovers,
-    zones,
-    robot,
-    site,
-    firmware,
-    map,
-    shift,
-    tags
-FROM stored_episode_rows
-JOIN (
-    SELECT recording_id, task_hash, clock_offset_ns, robot, site, firmware, map, shift, tags FROM recordings
-) USING (recording_id);
+SELECT *
+FROM (
+    SELECT
+        recording_id,
+        episode_id,
+        any_value(episode_index) AS episode_index,
+        any_value(task_hash) AS task_hash,
+        min(stamp_ns) AS start_ns,
+        max(stamp_ns) AS end_ns,
+        min(stamp_time) AS start_time,
+        max(stamp_time) AS end_time,
+        min(logged_time) AS logged_start_time,
+        max(logged_time) AS logged_end_time,
+        count(*) AS steps,
+        max(step_index) - min(step_index) + 1 - count(*) AS missing_steps,
+        (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
+        -- include: episode_columns.sql
+    FROM (
+        SELECT
+            *,
+            row_number() OVER (PARTITION BY episode_id ORDER BY step_index) > 1
+            AND behaviour_policy IS DISTINCT FROM lag(behaviour_policy) OVER (
+                PARTITION BY episode_id ORDER BY step_index
+            ) AS handover
+        FROM transitions
+        LEFT JOIN (
+            SELECT DISTINCT
+                task_hash AS of_task,
+                CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
+                json_extract_string(task_json, '$.goal') = 'route' AS has_goal
+            FROM recordings
+        ) AS tasks ON transitions.task_hash = tasks.of_task
+    )
+    GROUP BY recording_id, episode_id
+)
+JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
+    USING (recording_id);
 
 -- `transitions` with one row for each condition that holds in a transition, or one row, nominal, if none holds.
 CREATE OR REPLACE VIEW held_conditions AS
@@ -161,15 +160,18 @@ SELECT
     any_value(action_name) AS action_name,
     zone,
     behaviour_policy,
-    CAST(sum(rows_held) AS BIGINT) AS rows_held,
-    sum(rows_held) / sum(sum(primary_rows)) OVER () AS held_share,
-    CAST(sum(episodes_held) AS BIGINT) AS episodes_held,
-    sum(reward_sum) / nullif(sum(rewards), 0) AS reward_mean,
-    sum(terminated) / nullif(sum(known_ends), 0) AS terminal_fraction,
-    sum(successes) / nullif(sum(goal_episodes), 0) AS success_share,
-    CAST(sum(primary_rows) AS BIGINT) AS primary_rows,
-    sum(primary_rows) / sum(sum(primary_rows)) OVER () AS primary_share
-FROM stored_cells
+    count(*) AS rows_held,
+    count(*) / sum(count(*) FILTER (WHERE condition = primary_condition)) OVER () AS held_share,
+    count(DISTINCT episode_id) AS episodes_held,
+    avg(reward) AS reward_mean,
+    avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
+    (count(DISTINCT episode_id) FILTER (WHERE success))
+        / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share,
+    count(*) FILTER (WHERE condition = primary_condition) AS primary_rows,
+    (count(*) FILTER (WHERE condition = primary_condition))
+        / sum(count(*) FILTER (WHERE condition = primary_condition)) OVER () AS primary_share
+FROM held_conditions
+JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
 LEFT JOIN (
     SELECT action, CASE WHEN count(DISTINCT name) = 1 THEN min(name) END AS action_name
     FROM actions
@@ -179,7 +181,7 @@ GROUP BY condition, action, zone, behaviour_policy
 UNION ALL
 SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
 FROM untold_conditions
-WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM stored_cells)
+WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM held_conditions)
 ORDER BY condition, action, zone, behaviour_policy;
 
 -- One row per condition, including conditions never seen; nulls if it is unknown in all recordings.
@@ -187,55 +189,31 @@ CREATE OR REPLACE VIEW coverage_by_condition AS
 WITH seen AS (
     SELECT
         condition,
-        CAST(sum(rows_held) AS BIGINT) AS rows_held,
+        count(*) AS rows_held,
         count(DISTINCT recording_id) AS recordings,
         count(DISTINCT action) AS actions,
         count(DISTINCT zone) AS zones,
         list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
-        sum(reward_sum) / nullif(sum(rewards), 0) AS reward_mean,
-        sum(terminated) / nullif(sum(known_ends), 0) AS terminal_fraction,
-        CAST(sum(primary_rows) AS BIGINT) AS primary_rows
-    FROM stored_cells
+        avg(reward) AS reward_mean,
+        avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
+        count(*) FILTER (WHERE condition = primary_condition) AS primary_rows
+    FROM held_conditions
     GROUP BY condition
 ), by_episode AS (
     SELECT
         condition,
-        CAST(sum(episodes_held) AS BIGINT) AS episodes_held,
-        CAST(sum(rows_held) AS DOUBLE) * sum(rows_held) / sum(squared_rows) AS effective_episodes,
-        sum(successes) / nullif(sum(goal_episodes), 0) AS success_share,
-        sum(return_sum) / nullif(sum(returns), 0) AS return_mean
-    FROM stored_condition_episodes
+        count(*) AS episodes_held,
+        sum(n) * sum(n) / sum(n * n) AS effective_episodes,
+        avg(CAST(success AS INTEGER)) AS success_share,
+        avg(return) AS return_mean
+    FROM (
+        SELECT condition, episode_id, count(*) AS n FROM held_conditions GROUP BY condition, episode_id
+    )
+    JOIN episodes USING (episode_id)
     GROUP BY condition
 )
-SELECT
-    condition,
-    timing,
-    coalesce(rows_held, least) AS rows_held,
-    coalesce(rows_held, least) / nullif(sum(primary_rows) OVER (), 0) AS held_share,
-    coalesce(episodes_held, least) AS episodes_held,
-    coalesce(effective_episodes, least) AS effective_episodes,
-    success_share,
-    return_mean,
-    reward_mean,
-    terminal_fraction,
-    coalesce(recordings, least) AS recordings,
-    coalesce(actions, least) AS actions,
-    coalesce(zones, least) AS zones,
-    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies,
-    coalesce(primary_rows, least) AS primary_rows,
-    coalesce(primary_rows, least) / nullif(sum(primary_rows) OVER (), 0) AS primary_share,
-    coalesce(uncertain_recordings, least) AS uncertain_recordings
-FROM conditions
-FULL JOIN seen USING (condition)
-FULL JOIN by_episode USING (condition)
-LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
-    USING (condition)
-LEFT JOIN (
-    SELECT condition, count(*) AS uncertain_recordings
-    FROM (SELECT unnest(uncertain_conditions) AS condition FROM recordings)
-    GROUP BY condition
-) AS guessed USING (condition)
-ORDER BY rows_held DESC, condition;
+-- include: coverage_columns.sql
+;
 
 -- One row per perturbation of the twin; null: hardware, or a simulator that did not record it.
 CREATE OR REPLACE VIEW coverage_by_perturbation AS
@@ -274,31 +252,14 @@ FROM (
 GROUP BY perturbation, field
 ORDER BY perturbation, field;
 
--- Condition x action cells with fewer than `minimum` rows in which the condition holds, including empty cells.
-CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
-SELECT condition, action, action_name, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
-FROM (SELECT condition FROM conditions UNION SELECT condition FROM stored_cells)
-CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
-LEFT JOIN (SELECT condition, action, CAST(sum(rows_held) AS BIGINT) AS rows FROM stored_cells GROUP BY ALL)
-    USING (condition, action)
-ANTI JOIN untold_conditions USING (condition)
-WHERE coalesce(rows, 0) < minimum
-ORDER BY condition, action;
-
+-- Condition x action cells without a row in which the condition holds; cells_below(n) has those with fewer than n.
 CREATE OR REPLACE VIEW missing_cells AS
-SELECT condition, action, action_name, speed_mps, yaw_rate_radps FROM cells_below(1);
-
--- Rows per recording and cell, each row counted for its primary_condition.
-CREATE OR REPLACE VIEW recording_cells AS
-SELECT recording_id, condition, action, behaviour_policy, CAST(sum(primary_rows) AS BIGINT) AS rows
-FROM stored_cells
-WHERE primary_rows > 0
-GROUP BY ALL;
-
-CREATE OR REPLACE VIEW recording_conditions AS
-SELECT recording_id, condition, primary_rows AS rows, primary_episodes AS episodes
-FROM stored_condition_episodes
-WHERE primary_rows > 0;
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps
+FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
+CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
+ANTI JOIN (SELECT DISTINCT condition, action FROM held_conditions) USING (condition, action)
+ANTI JOIN untold_conditions USING (condition)
+ORDER BY condition, action;
 
 CREATE OR REPLACE VIEW reward_mix AS
 SELECT

@@ -52,7 +52,7 @@ def assert_views_match_scan(path: Path | str) -> None:
         scanned = duckdb.connect()
         rows = store.sql("FROM stored_transitions").to_arrow_table()
         manifests = store.sql("FROM stored_recordings").to_arrow_table()
-        made = views_over(scanned, rows, manifests)
+        made = views_over(scanned, rows, manifests, store.observation_type)
         made.make(" ".join(COMMON))
         made.hold(["transitions"])
         for view in COMMON:

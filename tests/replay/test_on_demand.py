@@ -6,7 +6,7 @@ import pytest
 from support.long import one_in
 
 from restock.errors import QueryError
-from restock.replay.store.definitions import install_named, script
+from restock.replay.store.definitions import MACROS, VIEWS, definitions, install_named
 from restock.replay.store.query import query
 from restock.replay.store.store import Store
 
@@ -20,7 +20,7 @@ def created_views(store: Store) -> set[str]:
 
 @pytest.mark.parametrize("every", one_in(2, [8, 1]))
 def test_every_view_and_macro_works_alone(store_path, every):
-    text = script(summaries=True)
+    text = definitions(names=[*VIEWS, *MACROS])
     views = re.findall(r"CREATE OR REPLACE VIEW (\w+)", text)
     assert {"events", "coverage_by_week", "drift", "signal_weeks"} <= set(views)
     for view in views[::every]:
@@ -40,7 +40,7 @@ def test_query_creates_only_views_it_needs(store_path):
         assert "transitions" in created_views(store)
         assert not created_views(store) & {"coverage", "coverage_by_condition", "held_conditions"}
         store.sql("FROM missing_cells").fetchall()
-        assert {"stored_cells", "conditions", "actions"} <= created_views(store)
+        assert {"held_conditions", "conditions", "actions"} <= created_views(store)
     with Store(store_path) as store:
         common = {"transitions", "episodes", "coverage", "label_scores", "corrections"}
         assert common <= {name for (name,) in store.connection.execute(_LISTED).fetchall()}

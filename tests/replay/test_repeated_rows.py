@@ -2,18 +2,19 @@
 
 from pathlib import Path
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.paths import SHARED
-from support.stores import TASK, manifest, recording_transitions, write_store
+from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.ingest.store.transitions import replaced
-from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.same_drives import install_shared_rows
 from restock.replay.store.store import Store
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 
@@ -125,15 +126,16 @@ def test_episodes_trained_under_other_id_are_not_held_out(tmp_path):
     assert f"{2 * len(drive['episode_id'].unique())} episodes left out" in dataset.notes[0]
 
 
-def test_replaced_ingests_are_ignored(tmp_path):
-    first, second = recording_transitions(1), recording_transitions(2)
-    copy = copy_of(first, 2)
-    writer = StoreWriter(tmp_path / "store")
-    for rows in (first, copy):
-        writer.write(manifest(rows), rows)
-    with Store(tmp_path / "store") as store:
-        assert len(store.sql("FROM shared_rows").fetchall()) == 2 * len(first)
-    rows = replaced(second, {"ingest_id": ["later"] * len(second)})
-    writer.write(manifest(rows), rows)
-    with Store(tmp_path / "store") as store:
-        assert store.sql("FROM shared_rows").fetchall() == []
+def test_replaced_ingests_are_ignored():
+    rows = pa.list_(pa.struct({"transition_id": pa.int64(), "content": pa.int64()}))
+    lists = [
+        [{"transition_id": 10 * place + n, "content": n} for n in (1, 2)] for place in (1, 2, 3)
+    ]
+    manifests = pa.table(
+        {"ingest_id": ["a", "old", "b"], "distinctive_rows": pa.array(lists, rows)}
+    )
+    with duckdb.connect() as connection:
+        current = {"a": "first", "b": "second"}
+        install_shared_rows(connection, lambda _: [manifests.slice(1), manifests[:1]], current, 4)
+        found = connection.sql("FROM shared_rows ORDER BY ALL").fetchall()
+    assert found == [("first", 11, 1), ("first", 12, 2), ("second", 31, 1), ("second", 32, 2)]

@@ -211,7 +211,7 @@ def ordered(
     ])  # fmt: skip
     with duckdb.connect() as connection:
         connection.register("driven", pa.Table.from_pylist(rows, schema))
-        connection.execute(definitions(["return_order.sql"]))
+        connection.execute(definitions(names=("return_order.sql",)))
         found = connection.sql(f"FROM return_order('driven', {min_episodes}, 0.1)")
         (row,) = found.fetchall()
         return dict(zip(found.columns, row, strict=True))

@@ -191,6 +191,7 @@ def views_over(
     connection: duckdb.DuckDBPyConnection,
     transitions: pa.Table,
     recordings: pa.Table,
+    observation_type: str = "FLOAT[]",
     planted: str = "",
 ) -> Definitions:
     """Return the views of a store over these rows, no summaries; `install_named` adds views.
@@ -205,7 +206,7 @@ def views_over(
             " recording_id || '/' || ingest_id || '.parquet' AS file FROM stored_transitions"
             " GROUP BY ALL"
         )
-    made = Definitions(connection)
+    made = Definitions(connection, observation_type)
     _kept.append(made)  # as a store keeps its own
     return made
 
