@@ -21,8 +21,16 @@ import pyarrow as pa
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.errors import StoreError
-from restock.ingest.profile.signal_paths import PathProblem, SignalPath, last_part
+from restock.errors import ConfigError, StoreError
+from restock.ingest.profile.signal_paths import (
+    IN,
+    UNITS,
+    PathProblem,
+    SignalPath,
+    factor_of,
+    last_part,
+    pressed_paths,
+)
 from restock.ingest.profile.tag_rules import NAMED
 from restock.ingest.task.schema import COLUMNS
 from restock.toml import Checked
@@ -277,13 +285,13 @@ class Form(NamedTuple):
         return (*self.needs, *self.either, *self.may)
 
 
-TURNS = ("yaw_rate_radps", "steering_rad")
+_TURNS = ("yaw_rate_radps", "steering_rad")
 _HEADING = ("orientation", "yaw_rad")  # a quaternion, which is converted to a yaw, or a yaw
 _TEXT = Form(("text",))
 BY_FIX = Form(("latitude_deg", "longitude_deg"), may=("status", "covariance_m2", "covariance_type"))
 BY_RATES = Form(("speed_mps", "yaw_rate_radps"), may=("sideways_mps",))
 INPUT_FIELDS: dict[str, Form] = {
-    "command": Form(("speed_mps",), TURNS, ("sideways_mps",)),
+    "command": Form(("speed_mps",), _TURNS, ("sideways_mps",)),
     "pose": Form(("x_m", "y_m"), _HEADING),  # other forms: BY_FIX, BY_RATES
     "heading": Form(either=_HEADING),  # only for a pose by fix
     "wheels": Form(("speed_mps", "yaw_rate_radps")),
@@ -294,12 +302,15 @@ INPUT_FIELDS: dict[str, Form] = {
     "goal": Form(("x_m", "y_m")),
     "plan": Form(("x_m", "y_m")),
     "bumper": Form(("pressed",)),
-    "nav_command": Form(("speed_mps",), TURNS),
+    "nav_command": Form(("speed_mps",), _TURNS),
     "behaviour_policy": _TEXT,
     "true_condition": _TEXT,
     "true_exposure": _TEXT,
     "perturbation": _TEXT,
 }
+# Fields of a source of commands: its commands, or a button that is pressed while it drives.
+COMMAND_SOURCE_FIELDS = ("speed_mps", *_TURNS, "pressed")
+
 # What replaces an input that the profile leaves out, or an optional one that a recording lacks.
 FALLBACKS: dict[str, str] = {
     "scan": "no lidar: clearance is unknown (null), and the observation has no sectors",
@@ -323,6 +334,16 @@ ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
 HINDSIGHT = {
     "goal": "in hindsight: where the drive stopped, turned back or went far enough",
     "plan": "in hindsight: the path that was driven",
+}
+
+
+FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
+SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad", "height_m", "angle_rad")
+_COMMAND, _SCAN, _FIX = "a command", "a scan", "a pose by latitude and longitude"
+_APPLIES_TO = {
+    "stop_holds": _COMMAND,
+    **dict.fromkeys(SCAN_SETTINGS, _SCAN),
+    **dict.fromkeys(FIX_SETTINGS, _FIX),
 }
 
 
@@ -397,3 +418,183 @@ class Inputs(Checked, frozen=True):
     def scans(self) -> dict[str, Input]:
         """Return the lidars, by name."""
         return {name: source for name, source in self.items() if name in SCANS}
+
+
+def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
+    """Check an input's fields and settings; `framed` says whether [frames] can give the pose.
+
+    Raises:
+        ConfigError: a field or setting is missing or does not apply; names the key.
+    """
+    form = INPUT_FIELDS[name]
+    if name == "pose" and (source.by_fix or source.by_rates):
+        form = BY_FIX if source.by_fix else BY_RATES
+    unknown = sorted(source.fields.keys() - form.known)
+    missing = sorted(form.needs - source.fields.keys())
+    given = [key for key in form.either if key in source.fields]
+    if form.either and not given:
+        missing.append(form.either[0])
+    if len(given) > 1:
+        unknown.append(f"{given[1]} beside {given[0]}")
+    _check_settings(f"inputs.{name}", name, source, where)
+    _check_units(f"inputs.{name}", source, where)
+    _check_wheelbase(f"inputs.{name}", source, where)
+    _check_pressed(f"inputs.{name}", source, where)
+    if unknown or missing:
+        problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
+        raise ConfigError(
+            f"`inputs.{name}.fields`: {', '.join(problems)}",
+            where=where,
+            remedy=f"{name} has the fields {', '.join(form.known)}",
+        )
+    if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
+        raise ConfigError(
+            f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
+            where=where,
+            remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
+        )
+
+
+def _check_settings(key: str, name: str, source: Input, where: str) -> None:
+    """Refuse settings that do not apply to an input; `name` is "" for a source of commands."""
+    own = {"command": _COMMAND, **dict.fromkeys(SCANS, _SCAN)}.get(name)
+    for setting, only in _APPLIES_TO.items():
+        applies = only == own or (only == _FIX and source.by_fix)
+        if getattr(source, setting) not in (None, False) and not applies:
+            raise ConfigError(
+                f"`{key}.{setting}` applies only to {only}", where=where, remedy="leave it out"
+            )
+
+
+def check_scans(scans: Mapping[str, Input], where: str) -> None:
+    """Check that the settings of all lidars are consistent.
+
+    Raises:
+        ConfigError: settings are inconsistent; names the key.
+    """
+    for name, source in scans.items():
+        if source.lidar_yaw_rad is not None and source.lidar_at_m is None:
+            raise ConfigError(
+                f"`inputs.{name}.lidar_yaw_rad` is given without lidar_at_m",
+                where=where,
+                remedy="give both, or lidar_x_m and lidar_yaw_rad of [task.body]",
+            )
+        _check_cloud(f"inputs.{name}", source, where)
+    if scans and "scan" not in scans:
+        raise ConfigError(
+            f"`inputs.{next(iter(scans))}` is given without `inputs.scan`",
+            where=where,
+            remedy="name the first lidar scan",
+        )
+    if len(scans) < 2:
+        return
+    for name, source in scans.items():
+        if source.lidar_at_m is None:
+            raise ConfigError(
+                f"`inputs.{name}.lidar_at_m` is missing: with several lidars, each needs its place",
+                where=where,
+                remedy="give lidar_at_m = [AHEAD, LEFT], from the middle of the outline, and"
+                " lidar_yaw_rad",
+            )
+        if source.optional:
+            raise ConfigError(
+                f"`inputs.{name}.optional`: with several lidars, none is optional: rows would "
+                "silently lack what only that one sees",
+                where=where,
+                remedy="leave it out, and give recordings without it a profile of their own",
+            )
+    topics = [source.topic for source in scans.values()]
+    if len(set(topics)) < len(topics):
+        raise ConfigError(
+            f"`inputs.{list(scans)[-1]}.topic`: two lidars have the same topic", where=where
+        )
+
+
+def _check_cloud(key: str, source: Input, where: str) -> None:
+    """Check the settings that turn a point cloud into a scan."""
+    if source.type != CLOUD:
+        for setting in ("height_m", "angle_rad"):
+            if getattr(source, setting) is not None:
+                what = f"`{key}.{setting}` applies only to {CLOUD}, not to {source.type}"
+                raise ConfigError(what, where=where, remedy="leave it out")
+        return
+    if source.height_m is None or source.fields != SCAN_OF_CLOUD:
+        fields = ", ".join(f'{key} = "{path}"' for key, path in SCAN_OF_CLOUD.items())
+        raise ConfigError(
+            f"`{key}`: a point cloud is read as the scan of a slice of it",
+            where=where,
+            remedy="give the slice, height_m = [LOW, HIGH] above the lidar, at which the robot can"
+            f" hit something, and the fields of that scan: fields = {{ {fields} }}",
+        )
+    for setting in ("height_m", "angle_rad"):
+        low, high = getattr(source, setting) or (0, 1)
+        if not low < high:
+            raise ConfigError(
+                f"`{key}.{setting}` must be [LOW, HIGH], got {[low, high]}", where=where
+            )
+
+
+def _check_pressed(key: str, source: Input, where: str) -> None:
+    try:
+        pressed_paths(source.fields.get("pressed", "data"))
+    except PathProblem as problem:
+        raise ConfigError(
+            f"`{key}.fields.pressed`: {source.fields['pressed']!r} {problem}",
+            where=where,
+            remedy='give a field, or several: "is_left_pressed or is_right_pressed"',
+        ) from None
+
+
+def _check_units(key: str, source: Input, where: str) -> None:
+    for field, path in source.fields.items():
+        if factor_of(field, path) is None:
+            raise ConfigError(
+                f"`{key}.fields.{field}`: {path!r} has an unknown unit",
+                where=where,
+                remedy=f"after a speed or a yaw rate:{IN}"
+                + ", ".join(unit for units in UNITS.values() for unit in units),
+            )
+
+
+def _check_wheelbase(key: str, source: Input, where: str) -> None:
+    if ("steering_rad" in source.fields) != (source.wheelbase_m is not None):
+        raise ConfigError(
+            f"`{key}`: steering_rad and wheelbase_m belong together",
+            where=where,
+            remedy="wheelbase_m is the distance between the axles, in metres",
+        )
+
+
+def check_command_source(key: str, source: Input, command: Input, where: str) -> None:
+    """Check that a source of commands has commands, or a button that is pressed while it drives.
+
+    Raises:
+        ConfigError: the source has neither; names the key.
+    """
+    commanding = source.fields.keys() - {"pressed"}
+    if unknown := sorted(source.fields.keys() - {*COMMAND_SOURCE_FIELDS}):
+        raise ConfigError(
+            f"`{key}.fields`: unknown {', '.join(map(repr, unknown))}",
+            where=where,
+            remedy=f"a source of commands has the fields {', '.join(COMMAND_SOURCE_FIELDS)}",
+        )
+    _check_units(key, source, where)
+    complete = "speed_mps" in commanding and len(commanding) == len(source.fields) == 2
+    if not (complete or source.fields.keys() == {"pressed"}):
+        raise ConfigError(
+            f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not show when this "
+            "source drives",
+            where=where,
+            remedy="give speed_mps with yaw_rate_radps (or steering_rad), or pressed alone",
+        )
+    if source.topic == command.topic and "pressed" not in source.fields:
+        raise ConfigError(
+            f"`{key}.topic` is the topic of the command, {command.topic}: this source would "
+            "always be in force",
+            where=where,
+            remedy="give the topic of this source's commands, before one of several sources is "
+            "chosen",
+        )
+    _check_wheelbase(key, source, where)
+    _check_pressed(key, source, where)
+    _check_settings(key, "", source, where)

@@ -229,11 +229,7 @@ def test_live_observer_and_ingest_agree_on_clouds(tmp_path):
         ("height_m = [-0.2, 0.6]\n", "", r"height_m = \[LOW, HIGH\] above the lidar"),
         ("[-0.2, 0.6]", "[0.6, -0.2]", r"height_m` must be \[LOW, HIGH\]"),
         ('"ranges"', '"data"', 'fields = { ranges_m = "ranges"'),
-        (
-            "PointCloud2",
-            "LaserScan",
-            "height_m` applies only to a scan of sensor_msgs/msg/PointCloud2",
-        ),
+        ("PointCloud2", "LaserScan", "height_m` applies only to sensor_msgs/msg/PointCloud2"),
     ],
 )
 def test_invalid_cloud_settings_are_rejected(old, new, message):

@@ -158,7 +158,7 @@ def test_drivers_are_unknown_without_sources(plain):
     ("text", "message"),
     [
         (PRESSED.replace('pressed = "buttons[4]"', 'speed_mps = "axes[1]"'), "does not show when"),
-        (PRESSED.replace("pressed", "presed"), "presed does not show when"),
+        (PRESSED.replace("pressed", "presed"), "unknown 'presed'"),
     ],
 )
 def test_sources_without_driver_information_are_rejected(text, message):
