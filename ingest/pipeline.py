@@ -14,6 +14,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import (
+    ConfigError,
     RecordingError,
     RestockError,
     StoreError,
@@ -211,12 +213,15 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
 
 def _has_other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
     """Return whether a recording was ingested with another [robot] in its profile."""
-    return _stored_profile(before["profile_toml"]).robot != profile.robot
+    stored = _stored_profile(before["profile_toml"])
+    return stored is not None and stored.robot != profile.robot
 
 
 @lru_cache(maxsize=64)  # many recordings share a profile
-def _stored_profile(text: str) -> Profile:
-    return parse_profile(text, where="profile_toml")
+def _stored_profile(text: str) -> Profile | None:
+    with suppress(ConfigError):  # a key of it may be gone from profiles since
+        return parse_profile(text, where="profile_toml")
+    return None
 
 
 def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> Staged:

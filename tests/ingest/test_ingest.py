@@ -13,6 +13,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
 BAGS = SHARED
@@ -62,6 +63,20 @@ def test_ingest_writes_transitions(bag, tmp_path, run):
         assert [c.name for c in store.conditions()] == [
             c.name for c in load_profile("warehouse_amr").conditions
         ]
+
+
+def test_known_recording_with_removed_profile_key_is_unchanged(bag, tmp_path, run, monkeypatch):
+    store = tmp_path / "s"
+    run(bag, "--store", store)
+    manifest = StoreWriter.manifest
+
+    def with_old_key(self: StoreWriter, recording_id: str) -> dict[str, Any] | None:
+        found = manifest(self, recording_id)
+        return found and found | {"profile_toml": "removed_key = 1\n" + found["profile_toml"]}
+
+    monkeypatch.setattr(StoreWriter, "manifest", with_old_key)
+    code, document, _ = run(bag, "--store", store)
+    assert (code, document["recordings"][0]["status"]) == (0, "unchanged")
 
 
 def test_unchanged_recording_is_skipped_and_changed_replaced(bag, tmp_path, run):
