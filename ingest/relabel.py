@@ -111,11 +111,17 @@ def relabel_rows(
     `definitions` are the outcomes and exposures.
 
     Raises:
+        StoreError: its rows lack the ends of their episodes: another tool wrote them.
         ConfigError: a condition's SQL fails on the stored signals.
     """
     rows = store.rows(row["recording_id"], row["ingest_id"])
     ends = episode_ends(rows)
-    assert ends is not None, "ingest writes the ends of all episodes"
+    if ends is None:
+        raise StoreError(
+            f"the rows of {row['source_file']} lack the ends of their episodes",
+            where=str(store.path),
+            remedy="ingest the recording again",
+        )
     signals = rows.select(ends.column_names)  # including the profile's own
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)

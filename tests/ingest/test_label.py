@@ -90,5 +90,10 @@ def test_concurrently_ingested_recording_is_not_relabelled(store, tmp_path):
     assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
 
 
-def test_relabelling_needs_a_store(tmp_path, shell):
+def test_relabelling_needs_a_store_and_episode_ends(store, tmp_path, shell):
     assert "there is no store, or it is empty" in shell.err("store", "label", tmp_path / "none")
+    writer = StoreWriter(store)
+    original = writer.rows
+    writer.rows = lambda *key: original(*key).replace_schema_metadata(None)
+    with pytest.raises(StoreError, match="lack the ends of their episodes"):
+        relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
