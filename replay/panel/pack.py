@@ -57,9 +57,7 @@ class PackedFile:
         self._path, self._width = path, width
         self._missing = rows * parts
         with path.open("wb") as file:
-            if (
-                rows
-            ):  # reserve the space: if the disk were full later, a signal would end the process
+            if rows:  # reserve the space: a disk that is full later would end the process
                 os.posix_fallocate(file.fileno(), 0, 4 * rows * width)
 
     def put(self, rows: Ints, *values: tuple[slice, NDArray[Any]]) -> None:

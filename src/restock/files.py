@@ -170,11 +170,13 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} may not be written"
     elif any(map(is_undecoded, str(absolute))):
         why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
-    for folder in absolute.parents:
-        for mark, kind in _MARKS.items():
-            if (folder / mark).exists():
-                why = f"is within {kind} {folder}: what replaces or removes that removes this, too"
-    if why is not None:
+    within = (
+        f"is within {kind} {folder}: what replaces or removes that removes this, too"
+        for folder in absolute.parents
+        for mark, kind in _MARKS.items()
+        if (folder / mark).exists()
+    )
+    if why := next(within, why):
         raise error(why, where=str(path), remedy="choose another --out")
 
 
